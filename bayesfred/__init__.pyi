@@ -1,0 +1,39 @@
+from . import runs
+from .analysis.diagnostics import Diagnostics, diagnose
+from .errors import InputError
+from .imaging.detector import Detector, correct_sampling, sampling_matrix
+from .imaging.distortion import PolynomialDistortion
+from .imaging.forward import ForwardModel
+from .imaging.psf import GaussianPSF
+from .imaging.scene import SourceCatalog
+from .inference.chainfile import Chain, open_chain
+from .inference.estimate import MapEstimate, find_map
+from .inference.moves import LaplaceMove
+from .inference.noise import BackgroundNoise, PoissonNoise, simulate
+from .inference.posterior import Nuisances, Posterior
+from .inference.sampling import sample
+
+__all__ = [
+    "BackgroundNoise",
+    "Chain",
+    "Detector",
+    "Diagnostics",
+    "ForwardModel",
+    "GaussianPSF",
+    "InputError",
+    "LaplaceMove",
+    "MapEstimate",
+    "Nuisances",
+    "PoissonNoise",
+    "PolynomialDistortion",
+    "Posterior",
+    "SourceCatalog",
+    "correct_sampling",
+    "diagnose",
+    "find_map",
+    "open_chain",
+    "runs",
+    "sample",
+    "sampling_matrix",
+    "simulate",
+]

@@ -1,0 +1,81 @@
+"""The command line: options in, exit codes out. What a command does is in `runs.py`.
+
+Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, 130 interrupted with everything saved.
+"""
+
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+import bayesfred as bf
+from bayesfred.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from bayesfred.runs import Result
+
+app = typer.Typer(
+    help="Posterior of an imaging system's field distortion, from a frame of photon counts.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Run = Annotated[Path, typer.Argument(metavar="RUN.toml", help="The run file.", show_default=False)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the output file.")]
+
+
+def _example() -> str:
+    """The example run file, marked paragraph by paragraph so that the help keeps its lines."""
+    text = resources.files("bayesfred").joinpath("example.toml").read_text(encoding="utf-8")
+    return "\n\n".join("\b\n" + paragraph for paragraph in text.strip().split("\n\n"))
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Option(help="Where demo.h5, demo.html and demo.png go.")] = Path("chains"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated frame and of the sampler.")] = 1,
+    overwrite: Overwrite = False,
+) -> None:
+    """Simulate the paper's frame, fit it and report: 81 sources, 12 coefficients, Poisson counts."""
+    _run(lambda: bf.runs.demo(folder, seed=seed, overwrite=overwrite))
+
+
+@app.command()
+def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
+    """Draw the frame that [simulation] describes into [frame] path, and its source grid, if any, into [catalogue] path."""
+    _run(lambda: bf.runs.simulate_frame(run_file, overwrite=overwrite))
+
+
+@app.command(epilog="A complete run file:\n\n" + _example())
+def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
+    """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
+    _run(lambda: bf.runs.fit(run_file, resume=resume, overwrite=overwrite))
+
+
+@app.command()
+def report(
+    chain_file: Annotated[Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)],
+    target_ess: Annotated[float, typer.Option(min=1, help="Effective draws to ask of every parameter.")] = 1000.0,
+) -> None:
+    """Judge a chain file anew and write its report, .html and .png, beside it."""
+    _run(lambda: bf.runs.report(chain_file, target_ess=target_ess))
+
+
+def _run(work: "Callable[[], Result | None]") -> None:
+    """Do a command's work; bad input becomes one line and exit code 2."""
+    try:
+        result = work()
+    except InputError as error:
+        typer.echo(f"bayesfred: {error}", err=True)
+        raise typer.Exit(2) from None
+    except KeyboardInterrupt:
+        typer.echo("bayesfred: interrupted; a run that was sampling has saved its steps: go on with --resume", err=True)
+        raise typer.Exit(130) from None
+    if result is not None and not result.diagnostics.converged:
+        raise typer.Exit(3)

@@ -1,0 +1,1 @@
+"""What a camera does: distortion coefficients to expected counts."""

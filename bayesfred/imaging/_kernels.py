@@ -1,0 +1,492 @@
+"""Compiled loops of the forward model: arrays in, arrays out, no validation.
+
+For one source the displacement is a polynomial in (u, v) alone, so the kernel's arguments
+
+    a = u - x + f(u, v, x, y) - offset_x,        b = v - y + g(u, v, x, y) - offset_y
+
+are two small coefficient matrices. They are expanded about the source's peak, where a = b = 0, which makes
+them well conditioned and gives the window of pixels to visit. Along a row of pixels they are polynomials in u
+alone, and so is the Jacobian determinant D = a_u b_v - a_v b_u: a sample of the kernel costs three Horner
+sweeps and one exponential. The degree in u reaches the innermost loop as the length of a tuple, that is as a
+compile-time constant, so that the loop over pixels vectorises for every degree.
+
+`forward.py` binds these functions to the public objects; the loops over counts are in `inference/_kernels.py`.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba.extending import intrinsic
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+# Reassociation is left out where a result's last digits matter: it would undo the two-part range reduction of exp.
+FAST = {"contract", "arcp", "nsz", "nnan", "ninf"}
+REDUCE = FAST | {"reassoc"}
+
+LANES = 8  # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
+SEGMENT = 16  # pixels that are marked together as reached by a source
+
+
+class Optics(NamedTuple):
+    """A forward model as the loops need it; s counts sources, k terms."""
+
+    x: Floats  # (s,) pixel
+    y: Floats
+    f_powers: Ints  # (k, 2) powers of u and v
+    g_powers: Ints
+    f_lever: Floats  # (s, k) x^i y^j
+    g_lever: Floats
+    offsets: Floats  # quadrature nodes of a pixel along one axis, pixel
+    weights: Floats
+    step: float  # pitch of the recorded pixels in fine pixels
+    ny: int
+    nx: int
+    cut: float  # -2 log(tolerance)
+    v_degree: int
+    u_degree: tuple[int, ...]  # its length is the degree in u of a and b
+    d_degree: tuple[int, ...]  # its length is the degree in u of D; empty where flux is not conserved
+
+
+class Maps(NamedTuple):
+    """Where the sources are imaged and which pixels they reach."""
+
+    a: Floats  # (s, u_degree + 1, v_degree + 1) coefficients about the peak
+    b: Floats
+    peak: Floats  # (s, 2) u, v
+    ellipse: Floats  # (s, 4) alpha, beta, gamma, R^2: alpha t^2 + 2 beta t w + gamma w^2 <= R^2
+    rows: Ints  # (s, 2) first row and the one after the last
+
+
+def stride(nx: int) -> int:
+    """Pixels a padded image row takes."""
+    return -(-(nx + LANES) // SEGMENT) * SEGMENT
+
+
+@intrinsic
+def as_float(typingctx: Any, bits: Any) -> Any:
+    """The float64 with these bits, without leaving a SIMD loop."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.DoubleType())
+
+    return nb.types.float64(nb.types.int64), codegen
+
+
+@intrinsic
+def as_bits(typingctx: Any, value: Any) -> Any:
+    """The bits of a float64 as an int64."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.IntType(64))
+
+    return nb.types.int64(nb.types.float64), codegen
+
+
+@nb.njit(fastmath=FAST, inline="always")
+def exp(x):
+    """exp(x) for -700 <= x <= 700 to 2.3e-16 relative: x = n log 2 + r, a polynomial of degree 13 in r, 2^n by its bits."""
+    x = min(max(x, -700.0), 700.0)
+    n = math.floor(x * 1.4426950408889634 + 0.5)
+    r = x - n * 6.93147180369123816490e-01
+    r = r - n * 1.90821492927058770002e-10
+    p = 1.0 / 6227020800.0
+    p = p * r + 1.0 / 479001600.0
+    p = p * r + 1.0 / 39916800.0
+    p = p * r + 1.0 / 3628800.0
+    p = p * r + 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    return p * as_float((nb.int64(n) + 1023) << 52)
+
+
+@nb.njit(cache=True)
+def _fill(o, s, theta, offset_x, offset_y, a, b):
+    """Coefficients of a and b of source s in powers of u and v, about the frame's middle."""
+    a[:] = 0.0
+    b[:] = 0.0
+    a[0, 0] = -o.x[s] - offset_x
+    b[0, 0] = -o.y[s] - offset_y
+    a[1, 0] = 1.0
+    b[0, 1] = 1.0
+    n_f = o.f_powers.shape[0]
+    for k in range(n_f):
+        a[o.f_powers[k, 0], o.f_powers[k, 1]] += theta[k] * o.f_lever[s, k]
+    for k in range(o.g_powers.shape[0]):
+        b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_lever[s, k]
+
+
+@nb.njit(cache=True)
+def _shift(c, h, k):
+    """c(u, v) -> c(u + h, v + k) in place, by repeated synthetic division."""
+    m1, n1 = c.shape
+    for n in range(n1):
+        for i in range(m1 - 1):
+            for m in range(m1 - 2, i - 1, -1):
+                c[m, n] += h * c[m + 1, n]
+    for m in range(m1):
+        for i in range(n1 - 1):
+            for n in range(n1 - 2, i - 1, -1):
+                c[m, n] += k * c[m, n + 1]
+
+
+@nb.njit(cache=True)
+def _find_peak(o, s, theta, offset_x, offset_y, a, b):
+    """Newton's iteration for a = b = 0, leaving a and b expanded about the solution. Returns u, v, found."""
+    u = o.x[s] + offset_x
+    v = o.y[s] + offset_y
+    far = 4.0 * o.step * (o.nx + o.ny)
+    found = False
+    _fill(o, s, theta, offset_x, offset_y, a, b)
+    _shift(a, u, v)
+    _shift(b, u, v)
+    for _ in range(50):
+        det = a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0]
+        if det == 0.0:
+            break
+        h = (a[0, 1] * b[0, 0] - b[0, 1] * a[0, 0]) / det
+        k = (b[1, 0] * a[0, 0] - a[1, 0] * b[0, 0]) / det
+        if not (abs(h) + abs(k) < far):
+            break
+        u += h
+        v += k
+        _shift(a, h, k)
+        _shift(b, h, k)
+        if abs(h) + abs(k) <= 1e-9:  # quadratic convergence: the next step would be far below rounding
+            found = True
+            break
+    if not found:
+        u = o.x[s]
+        v = o.y[s]
+    _fill(o, s, theta, offset_x, offset_y, a, b)  # one shift from the start, free of the steps' rounding
+    _shift(a, u, v)
+    _shift(b, u, v)
+    return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
+
+
+@nb.njit(cache=True)
+def _reach(o, a, b, sigma):
+    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = sigma sqrt(cut); inf: the frame.
+
+    With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2 of
+    |c_mn| |d|^(m + n). On the ellipse |J d| = R' one has |d| <= R'/s, s the smaller singular value of J, hence
+    |(a, b)| >= R' - rho(R'/s) >= R as soon as R' >= R + rho(R'/s). The set |(a, b)| <= R around the peak is
+    connected where the map does not fold, so it lies inside. The smallest such R' is a fixed point. A pixel is
+    visited if its centre is within the ellipse enlarged by its farthest quadrature node.
+    """
+    j11, j12, j21, j22 = a[1, 0], a[0, 1], b[1, 0], b[0, 1]
+    half = 0.5 * (j11 * j11 + j12 * j12 + j21 * j21 + j22 * j22)
+    det = j11 * j22 - j12 * j21
+    root = math.sqrt(max(half * half - det * det, 0.0))
+    largest = math.sqrt(half + root)
+    smallest = abs(det) / largest if largest > 0.0 else 0.0
+    radius = sigma * math.sqrt(o.cut)
+    if not (smallest > 0.0 and radius < math.inf):
+        return math.inf
+    reach = radius
+    for _ in range(60):
+        d = reach / smallest
+        rest = 0.0
+        for m in range(a.shape[0]):
+            for n in range(a.shape[1]):
+                if m + n >= 2:
+                    rest += math.hypot(a[m, n], b[m, n]) * d ** (m + n)
+        if radius + rest <= reach * (1.0 + 1e-6):
+            return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * np.max(np.abs(o.offsets))
+        reach = radius + rest
+        if reach > 4.0 * radius:
+            break
+    return math.inf
+
+
+@nb.njit(cache=True)
+def locate(o, theta, offset_x, offset_y, sigma, maps):
+    """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak)."""
+    unfolded = True
+    for s in range(o.x.size):
+        a = maps.a[s]
+        b = maps.b[s]
+        u, v, ok = _find_peak(o, s, theta, offset_x, offset_y, a, b)
+        unfolded = unfolded and ok
+        maps.peak[s, 0] = u
+        maps.peak[s, 1] = v
+        reach = _reach(o, a, b, sigma) if ok else math.inf
+        if reach < math.inf:
+            alpha = a[1, 0] ** 2 + b[1, 0] ** 2
+            maps.ellipse[s, 0] = alpha
+            maps.ellipse[s, 1] = a[1, 0] * a[0, 1] + b[1, 0] * b[0, 1]
+            maps.ellipse[s, 2] = a[0, 1] ** 2 + b[0, 1] ** 2
+            maps.ellipse[s, 3] = reach * reach
+            height = reach * math.sqrt(alpha) / abs(a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0])
+            centre = 0.5 * (o.ny - 1)
+            low = min(max((v - height) / o.step + centre, -1.0), 1.0 * o.ny)
+            high = min(max((v + height) / o.step + centre, -1.0), 1.0 * o.ny)
+            maps.rows[s, 0] = max(math.ceil(low), 0)
+            maps.rows[s, 1] = min(math.floor(high), o.ny - 1) + 1
+        else:
+            maps.ellipse[s] = 0.0
+            maps.rows[s, 0] = 0
+            maps.rows[s, 1] = o.ny
+    return unfolded
+
+
+@nb.njit(cache=True, inline="always")
+def chord(peak, ellipse, j, ny, nx, step):
+    """First pixel and number of pixels of row j that a source reaches; the number is a multiple of LANES."""
+    low = 0
+    high = nx
+    alpha = ellipse[0]
+    if alpha > 0.0:
+        w = (j - 0.5 * (ny - 1)) * step - peak[1]
+        beta = ellipse[1]
+        disc = beta * beta * w * w - alpha * (ellipse[2] * w * w - ellipse[3])
+        if disc < 0.0:
+            return 0, 0
+        middle = peak[0] - beta * w / alpha
+        half = math.sqrt(disc) / alpha
+        centre = 0.5 * (nx - 1)
+        left = min(max((middle - half) / step + centre, 0.0), 1.0 * nx)
+        right = min(max((middle + half) / step + centre, -1.0), nx - 1.0)
+        low = math.ceil(left)
+        high = math.floor(right) + 1
+    if high <= low:
+        return 0, 0
+    return low, -(-(high - low) // LANES) * LANES
+
+
+@nb.njit(cache=True, fastmath=FAST)
+def _row(a, b, w, ra, rb, rav, rbv, rd, u_degree, d_degree):
+    """Coefficients in t = u - u_peak of a, b, a_v, b_v and D on the row at v = v_peak + w."""
+    size = len(u_degree) + 1
+    for m in range(size):
+        pa, pb, pav, pbv = 0.0, 0.0, 0.0, 0.0
+        for k in range(a.shape[1]):
+            n = a.shape[1] - 1 - k
+            pav = pav * w + pa  # Horner's scheme carries the derivative along
+            pbv = pbv * w + pb
+            pa = pa * w + a[m, n]
+            pb = pb * w + b[m, n]
+        ra[m], rb[m], rav[m], rbv[m] = pa, pb, pav, pbv
+    if len(d_degree) > 0:
+        for p in range(len(d_degree) + 1):
+            d = 0.0
+            for m in range(1, size):
+                if 0 <= p + 1 - m < size:
+                    d += m * (ra[m] * rbv[p + 1 - m] - rb[m] * rav[p + 1 - m])
+            rd[p] = d
+    else:
+        rd[0] = 1.0
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _add_row(row, t0, step, ra, rb, rd, k, amplitude, u_degree, d_degree):
+    """row[i] += amplitude exp(k (a^2 + b^2)) |D| at t = t0 + i step."""
+    top = len(u_degree)
+    d_top = len(d_degree)
+    for i in range(row.size):
+        t = t0 + step * i
+        a = ra[top]
+        b = rb[top]
+        for m in range(top):
+            a = a * t + ra[top - 1 - m]
+            b = b * t + rb[top - 1 - m]
+        d = rd[d_top]
+        for m in range(d_top):
+            d = d * t + rd[d_top - 1 - m]
+        row[i] += amplitude * exp(k * (a * a + b * b)) * abs(d)
+
+
+@nb.njit(cache=True, inline="always")
+def add_pixels(row, w, t, a, b, offsets, weights, step, sigma, amplitude, work, u_degree, d_degree):
+    """Add a source's counts to a row of pixels whose first centre is (t, w) from the peak."""
+    ra, rb, rav, rbv, rd = work[0], work[1], work[2], work[3], work[4]
+    k = -0.5 / (sigma * sigma)
+    norm = amplitude / (2.0 * math.pi * sigma * sigma)
+    for q in range(offsets.size):
+        _row(a, b, w + offsets[q], ra, rb, rav, rbv, rd, u_degree, d_degree)
+        for p in range(offsets.size):
+            _add_row(row, t + offsets[p], step, ra, rb, rd, k, norm * weights[q] * weights[p], u_degree, d_degree)
+
+
+@nb.njit(cache=True)
+def add_source(o, maps, s, sigma, flux, out, work):
+    """Add source s to the padded, flattened image `out`."""
+    # What the rows share is taken out of the tuples once: handing them on costs more than a short row.
+    a, b, peak, ellipse = maps.a[s], maps.b[s], maps.peak[s], maps.ellipse[s]
+    offsets, weights, step, ny, nx = o.offsets, o.weights, o.step, o.ny, o.nx
+    pitch = out.size // ny
+    for j in range(maps.rows[s, 0], maps.rows[s, 1]):
+        low, n = chord(peak, ellipse, j, ny, nx, step)
+        if n > 0:
+            start = j * pitch + low
+            w = (j - 0.5 * (ny - 1)) * step - peak[1]
+            t = (low - 0.5 * (nx - 1)) * step - peak[0]
+            row = out[start : start + n]
+            add_pixels(row, w, t, a, b, offsets, weights, step, sigma, flux, work, o.u_degree, o.d_degree)
+
+
+@nb.njit(cache=True)
+def new_maps(o):
+    """Room for the maps of all sources."""
+    size = o.x.size
+    shape = (size, len(o.u_degree) + 1, o.v_degree + 1)
+    return Maps(np.empty(shape), np.empty(shape), np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
+
+
+@nb.njit(cache=True)
+def new_work(o):
+    """Room for a row's polynomials."""
+    return np.empty((5, 2 * len(o.u_degree) + 2))
+
+
+@nb.njit(cache=True, nogil=True)
+def image(o, theta, offset_x, offset_y, sigma, flux, out):
+    """Add all sources to the padded, flattened image `out`. Returns False where a source's map folds."""
+    maps = new_maps(o)
+    work = new_work(o)
+    unfolded = locate(o, theta, offset_x, offset_y, sigma, maps)
+    for s in range(o.x.size):
+        add_source(o, maps, s, sigma, flux[s], out, work)
+    return unfolded
+
+
+class Basis(NamedTuple):
+    """What derivatives are made of: the unit-flux kernel's derivative with respect to single monomials of f and g.
+
+    d K / d theta_k of a source is lever[s, k] times row[k] of the basis: first the monomials u^m v^n of f,
+    then those of g, then K itself (flux), then dK/dsigma.
+    """
+
+    f: Ints  # (., 2) powers of u and v
+    g: Ints
+    row: Ints  # (parameters,)
+    lever: Floats  # (s, parameters)
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _gradient_row(o, n, t0, u0, ra, rb, rav, rbv, sigma, weight, samples, powers, row_k, row_s):
+    """Samples of the kernel's first derivatives on one row of nodes, and the powers of u there.
+
+    With E = weight p and s = sign(D): samples = p_a |D|, p_b |D|, s E b_v, s E b_u, s E a_u, s E a_v.
+    """
+    top = len(o.u_degree)
+    conserve = len(o.d_degree) > 0
+    k = -0.5 / (sigma * sigma)
+    inverse = 1.0 / (sigma * sigma)
+    step = o.step
+    for i in range(n):
+        t = t0 + step * i
+        a, b, av, bv = ra[top], rb[top], rav[top], rbv[top]
+        au, bu = 0.0, 0.0
+        for m in range(top):
+            au = au * t + a
+            bu = bu * t + b
+            a = a * t + ra[top - 1 - m]
+            b = b * t + rb[top - 1 - m]
+            av = av * t + rav[top - 1 - m]
+            bv = bv * t + rbv[top - 1 - m]
+        r2 = a * a + b * b
+        e = weight * exp(k * r2)
+        d = au * bv - av * bu
+        size = abs(d) if conserve else 1.0
+        signed = (e if d > 0.0 else -e) if conserve else 0.0
+        samples[0, i] = -a * inverse * e * size
+        samples[1, i] = -b * inverse * e * size
+        samples[2, i] = signed * bv
+        samples[3, i] = signed * bu
+        samples[4, i] = signed * au
+        samples[5, i] = signed * av
+        row_k[i] += e * size
+        row_s[i] += e * size * (r2 * inverse - 2.0) / sigma
+        powers[0, i] = 1.0
+        u = u0 + step * i
+        for m in range(top):
+            powers[m + 1, i] = powers[m, i] * u
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _add_monomials(basis_powers, v, n, along, first, second, powers, out):
+    """Rows of the basis: B p_a |D| + s E (B_u first - B_v second) for the monomials B = u^m v^n of f (or of g)."""
+    for k in range(basis_powers.shape[0]):
+        m = basis_powers[k, 0]
+        q = basis_powers[k, 1]
+        vq = v**q
+        row = out[k]
+        by = q * v ** (q - 1) if q > 0 else 0.0
+        for i in range(n):
+            row[i] += powers[m, i] * (vq * along[i] - by * second[i])
+        if m > 0:
+            bx = m * vq
+            for i in range(n):
+                row[i] += bx * powers[m - 1, i] * first[i]
+
+
+@nb.njit(cache=True)
+def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
+    """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
+
+    An f-term B changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term changes
+    b, hence p by p_b B and D by B_v a_u - B_u a_v.
+    """
+    n_f = basis.f.shape[0]
+    n_g = basis.g.shape[0]
+    out[:, :n] = 0.0
+    norm = 1.0 / (2.0 * math.pi * sigma * sigma)
+    v_row = (j - 0.5 * (o.ny - 1)) * o.step
+    u_row = (low - 0.5 * (o.nx - 1)) * o.step
+    for q in range(o.offsets.size):
+        v = v_row + o.offsets[q]
+        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], work[0], work[1], work[2], work[3], work[4], o.u_degree, ())
+        for p in range(o.offsets.size):
+            u = u_row + o.offsets[p]
+            weight = norm * o.weights[q] * o.weights[p]
+            _gradient_row(
+                o, n, u - maps.peak[s, 0], u, work[0], work[1], work[2], work[3], sigma, weight,
+                samples, powers, out[n_f + n_g], out[n_f + n_g + 1],
+            )  # fmt: skip
+            _add_monomials(basis.f, v, n, samples[0], samples[2], samples[3], powers, out[:n_f])
+            samples[4:6] *= -1.0
+            _add_monomials(basis.g, v, n, samples[1], samples[5], samples[4], powers, out[n_f : n_f + n_g])
+
+
+@nb.njit(cache=True, fastmath=FAST)
+def add_jacobian_rows(o, maps, basis, flux, sigma, first, last, out):
+    """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
+    work = new_work(o)
+    width = out.shape[2]
+    rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
+    samples = np.empty((6, width))
+    powers = np.empty((len(o.u_degree) + 1, width))
+    for s in range(o.x.size):
+        for j in range(max(first, maps.rows[s, 0]), min(last, maps.rows[s, 1])):
+            low, n = chord(maps.peak[s], maps.ellipse[s], j, o.ny, o.nx, o.step)
+            if n == 0:
+                continue
+            basis_row(o, maps, basis, s, j, low, n, sigma, rows, samples, powers, work)
+            for k in range(basis.row.size):
+                c = flux[s] * basis.lever[s, k]
+                if c != 0.0:
+                    source = rows[basis.row[k]]
+                    target = out[k, j - first, low : low + n]
+                    for i in range(n):
+                        target[i] += c * source[i]
+
+
+@nb.njit(cache=True, nogil=True)
+def jacobian(o, theta, sigma, flux, basis, out):
+    """d image / d parameters into out (parameters, ny, padded row)."""
+    maps = new_maps(o)
+    locate(o, theta, 0.0, 0.0, sigma, maps)
+    add_jacobian_rows(o, maps, basis, flux, sigma, 0, o.ny, out)

@@ -1,0 +1,207 @@
+"""The forward model: distortion coefficients to expected counts, and their derivatives.
+
+    mu(u, v) = background + sum_s F_s p(u - x_s + f, v - y_s + g) |D|,    D = (1 + f_u)(1 + g_v) - f_v g_u
+
+|D| makes each source's kernel integrate to one over the image, the constraint that Sun & Zhou state below
+their Eq. 1; their simulated kernel leaves it out, and so does `conserve_flux=False`. The sums over pixels are in
+`_kernels.py`; `inference/posterior.py` compares the result with counts.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred.errors import InputError
+from bayesfred.imaging import _kernels
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.imaging.scene import SourceCatalog
+
+Floats = npt.NDArray[np.float64]
+
+# An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2): 1 % at this width.
+NARROWEST_IMPULSE = math.sqrt(math.log(400.0) / (2.0 * math.pi**2))
+
+
+@dataclass(frozen=True)
+class ForwardModel:
+    """Expected counts of a distorted field of point sources.
+
+    Parameters
+    ----------
+    detector : Detector
+        Geometry and pixel response of the recorded frame.
+    sources : SourceCatalog
+        Positions (pixel) and fluxes (counts) in the object plane.
+    psf : GaussianPSF
+        Reference PSF at the axis.
+    distortion : PolynomialDistortion
+        The terms of f and g.
+    conserve_flux : bool
+        Whether the kernel carries |D|. False is the kernel as the paper prints it.
+    tolerance : float
+        Pixels where the PSF is below `tolerance` times its peak may be left out; 0 visits every pixel for every
+        source.
+
+    Raises
+    ------
+    InputError
+        If the tolerance is outside [0, 1), or the PSF is too narrow to be sampled at pixel centres.
+
+    References
+    ----------
+    Sun & Zhou, Eq. 1 and 3.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65)), bf.SourceCatalog([0.0], [0.0], [1e4]), bf.GaussianPSF(3.0),
+    ...     bf.PolynomialDistortion.mirrored())
+    >>> counts = model.expected_counts(np.zeros(12), background=2.0)
+    >>> counts.shape, round(float(counts.sum() - 2 * 65**2), 3)
+    ((65, 65), 10000.0)
+    """
+
+    detector: Detector
+    sources: SourceCatalog
+    psf: GaussianPSF
+    distortion: PolynomialDistortion
+    conserve_flux: bool = field(default=True, kw_only=True)
+    tolerance: float = field(default=1e-8, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.tolerance < 1.0:
+            raise InputError(f"model: tolerance: got {self.tolerance}, expected 0 <= tolerance < 1")
+        if self.detector.pixel == "impulse" and self.psf.sigma < NARROWEST_IMPULSE:
+            raise InputError(
+                f"psf: sigma: got {self.psf.sigma} pixel with pixel = 'impulse', narrower than the pixel: expected at least "
+                f"{NARROWEST_IMPULSE:.2f}, below which sampled flux depends on the sub-pixel position; use pixel = 'box'"
+            )
+
+    def optics(self, narrowest: float | None = None) -> _kernels.Optics:
+        """The model as the compiled loops need it, with pixels integrated well for PSFs down to `narrowest` (pixel)."""
+        f = np.array(self.distortion.f_terms, dtype=np.int64).reshape(-1, 4)
+        g = np.array(self.distortion.g_terms, dtype=np.int64).reshape(-1, 4)
+        u_degree = max(1, int(np.concatenate([f, g])[:, 2].max()))
+        x, y = self.sources.x[:, None], self.sources.y[:, None]
+        ny, nx = self.detector.shape
+        offsets, weights = self.detector.quadrature(self.psf.sigma if narrowest is None else narrowest)
+        return _kernels.Optics(
+            x=self.sources.x,
+            y=self.sources.y,
+            f_powers=f[:, 2:].copy(),
+            g_powers=g[:, 2:].copy(),
+            f_lever=np.ascontiguousarray(x ** f[:, 0] * y ** f[:, 1]),
+            g_lever=np.ascontiguousarray(x ** g[:, 0] * y ** g[:, 1]),
+            offsets=offsets,
+            weights=weights,
+            step=float(self.detector.binning),
+            ny=ny,
+            nx=nx,
+            cut=-2.0 * math.log(self.tolerance) if self.tolerance > 0 else math.inf,
+            v_degree=max(1, int(np.concatenate([f, g])[:, 3].max())),
+            u_degree=(0,) * u_degree,
+            d_degree=(0,) * (2 * u_degree - 1) if self.conserve_flux else (),
+        )
+
+    def basis(self, nuisances: Sequence[str] = ()) -> _kernels.Basis:
+        """What the derivatives are made of: those with respect to theta, then to the named nuisances."""
+        d, ones = self.distortion, np.ones((len(self.sources), 1))
+        constant = [(0, 0)] if "offset_x" in nuisances else []
+        f = list(dict.fromkeys([t[2:] for t in d.f_terms] + constant))
+        g = list(dict.fromkeys([t[2:] for t in d.g_terms] + constant))
+        index = [f.index(t[2:]) for t in d.f_terms] + [len(f) + g.index(t[2:]) for t in d.g_terms]
+        optics = self.optics()
+        levers = [optics.f_lever, optics.g_lever]
+        for name in nuisances:
+            if name == "offset_x":  # the offsets enter a and b with a minus
+                index.append(f.index((0, 0)))
+            elif name == "offset_y":
+                index.append(len(f) + g.index((0, 0)))
+            else:
+                index.append(len(f) + len(g) + ("flux_scale", "psf_sigma").index(name))
+            levers.append(-ones if name.startswith("offset") else ones)
+        return _kernels.Basis(
+            f=np.array(f, dtype=np.int64).reshape(-1, 2),
+            g=np.array(g, dtype=np.int64).reshape(-1, 2),
+            row=np.array(index, dtype=np.int64),
+            lever=np.ascontiguousarray(np.concatenate(levers, axis=1)),
+        )
+
+    def expected_counts(self, theta: npt.ArrayLike, background: float = 0.0) -> Floats:
+        """Expected counts of every pixel.
+
+        Parameters
+        ----------
+        theta : array_like, shape (n_terms,), pixel^(1 - degree of the term)
+            Distortion coefficients in the order of `distortion.names`.
+        background : float, counts per pixel
+
+        Returns
+        -------
+        ndarray, shape (ny, nx), counts per pixel
+
+        Raises
+        ------
+        InputError
+            If `theta` has another shape.
+        """
+        ny, nx = self.detector.shape
+        out = np.zeros(ny * _kernels.stride(nx))
+        optics = self.optics()
+        _kernels.image(optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
+        counts = out.reshape(ny, -1)[:, :nx]
+        counts += background
+        return counts
+
+    def jacobian(self, theta: npt.ArrayLike) -> Floats:
+        """Derivatives of the expected counts with respect to theta.
+
+        For an f-term with monomial B, F [p_a B |D| + p sign(D) (B_u (1 + g_v) - B_v g_u)]; for a g-term
+        F [p_b B |D| + p sign(D) (B_v (1 + f_u) - B_u f_v)]; without flux conservation the first half alone.
+
+        Parameters
+        ----------
+        theta : array_like, shape (n_terms,), pixel^(1 - degree of the term)
+
+        Returns
+        -------
+        ndarray, shape (n_terms, ny, nx), counts per pixel per unit of the coefficient
+        """
+        ny, nx = self.detector.shape
+        out = np.zeros((self.distortion.n_terms, ny, _kernels.stride(nx)))
+        _kernels.jacobian(self.optics(), self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out)
+        return out[:, :, :nx]
+
+    def _check(self, theta: npt.ArrayLike) -> Floats:
+        values = np.ascontiguousarray(theta, dtype=np.float64)
+        if values.shape != (self.distortion.n_terms,):
+            raise InputError(
+                f"theta: got shape {values.shape}, expected ({self.distortion.n_terms},): " + ", ".join(self.distortion.names)
+            )
+        return values
+
+    def write(self, group: Any) -> None:
+        """Store the model in an HDF5 group."""
+        group.attrs["conserve_flux"] = self.conserve_flux
+        group.attrs["tolerance"] = self.tolerance
+        for name in ("detector", "sources", "psf", "distortion"):
+            getattr(self, name).write(group.create_group(name))
+
+    @classmethod
+    def read(cls, group: Any) -> "ForwardModel":
+        """The model stored in an HDF5 group by `write`."""
+        return cls(
+            Detector.read(group["detector"]),
+            SourceCatalog.read(group["sources"]),
+            GaussianPSF.read(group["psf"]),
+            PolynomialDistortion.read(group["distortion"]),
+            conserve_flux=bool(group.attrs["conserve_flux"]),
+            tolerance=float(group.attrs["tolerance"]),
+        )

@@ -1,0 +1,1 @@
+"""What the counts say: a frame to draws from its posterior."""

@@ -1,0 +1,844 @@
+"""Compiled loops over counts: log-likelihood, its exact gradient, Fisher information, profiled fluxes.
+
+Only pixels that a source reaches are visited one by one: `Workspace.flags` marks them in segments, and where the
+background is constant the rest enters through its counts and number alone. The workspace's image is zero between
+calls; whoever reads it clears it.
+
+Free fluxes. Given everything else the expected counts mu = B + sum_s F_s K_s are linear in the fluxes F, and with the
+prior F_s ~ Gamma(2, scale c_s/2) the log-posterior in F is concave and self-concordant. Newton's iteration, damped by
+1/(1 + decrement) until it converges quadratically, finds its maximum from any start. With H minus its Hessian there,
+
+    log L(theta) = max_F [log L(theta, F) + log p(F)] + n_s/2 log(2 pi) - 1/2 log det H          (Laplace)
+
+H couples only sources whose footprints share pixels, so everything is done cluster by cluster of touching footprints.
+
+Gradient of the Laplace term. Per pixel let r = n/mu - 1, W = n/mu^2, T = n/mu^3, and for sources s, t let
+Q = H^-1, q_s = sum_t Q_st K_t, h = sum_s K_s q_s. Because dW = -2 T dmu and the maximising F moves by
+dF = Q d(dL/dF), the chain rule gives for any parameter, with z = Q (sum_p T h K + Q_tt / F_t^3) and y = sum_t z_t K_t,
+
+    d log L = sum_p A dB + sum_s sum_p c_s dK_s,   A = r + T h - W y,   c_s = F_s A + z_s r - W q_s.
+
+The 1/F_t^3 is the prior's share: it adds 1/F_t^2 to H. With fixed fluxes A = r and c_s = F_s r.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred.imaging._kernels import (
+    FAST,
+    REDUCE,
+    SEGMENT,
+    Floats,
+    Ints,
+    add_jacobian_rows,
+    add_pixels,
+    add_source,
+    as_bits,
+    as_float,
+    basis_row,
+    chord,
+    locate,
+    new_maps,
+    new_work,
+)
+
+Flags = npt.NDArray[np.uint8]
+
+MASKED = -1e300  # stands for the counts of a pixel outside the likelihood
+LIMIT = -1e299
+
+POISSON = 0
+GAUSSIAN = 1  # variance equal to the background: the paper's noise
+
+
+class Counts(NamedTuple):
+    """The frame as the loops need it; rows are padded to `stride`, pixels outside the likelihood are MASKED.
+
+    Read noise is in it already: its variance is added to the values here and to the constant background on every call.
+    """
+
+    values: Floats  # (ny * stride,)
+    segment_pixels: Floats  # (ny * stride / SEGMENT,) how many pixels count
+    segment_sum: Floats  # of their counts
+    segment_squares: Floats
+    pixels: float
+    total: float
+    squares: float
+    nx: int
+    kind: int
+    varies: bool  # whether the background is a polynomial of order > 0
+
+
+class Workspace(NamedTuple):
+    """A thread's buffers."""
+
+    image: Floats  # (ny * stride,), zero between calls
+    flags: Flags  # (ny * stride / SEGMENT,) segments that a source reaches
+    span: Ints  # (ny, 2) first and last marked segment of a row
+    score: Floats  # (ny * stride,) scratch
+    weight: Floats
+
+
+class Footprints(NamedTuple):
+    """The pixels of every source, as rows: of source s those from first[s] to first[s + 1]."""
+
+    first: Ints  # (s + 1,)
+    low: Ints  # (rows,) first pixel
+    size: Ints  # pixels
+    start: Ints  # (rows + 1,) where the row's samples begin
+    row: Ints  # the frame's row
+
+
+class Clusters(NamedTuple):
+    """Groups of sources whose footprints share pixels: group c holds members[first[c]:first[c + 1]]."""
+
+    members: Ints
+    first: Ints
+    start: Ints  # where the group's matrix begins in a flat array
+
+
+@nb.njit(fastmath=FAST, inline="always")
+def log(x):
+    """log(x) of a positive normal number to 3e-16 (absolute near 1): the mantissa m in [0.7, 1.41] by bits, then 2 artanh."""
+    bits = as_bits(x)
+    k = (bits - 4604544271217802189) >> 52  # exponent, counted from sqrt(1/2)
+    m = as_float(bits - (k << 52))
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    p = 1.0 / 21.0
+    p = p * z + 1.0 / 19.0
+    p = p * z + 1.0 / 17.0
+    p = p * z + 1.0 / 15.0
+    p = p * z + 1.0 / 13.0
+    p = p * z + 1.0 / 11.0
+    p = p * z + 1.0 / 9.0
+    p = p * z + 1.0 / 7.0
+    p = p * z + 0.2
+    p = p * z + 1.0 / 3.0
+    return k * 6.93147180369123816490e-01 + (2.0 * s + (2.0 * s * z * p + k * 1.90821492927058770002e-10))
+
+
+@nb.njit(cache=True)
+def new_workspace(ny, pitch):
+    """Buffers for one thread."""
+    span = np.empty((ny, 2), np.int64)
+    span[:, 0] = pitch
+    span[:, 1] = -1
+    size = ny * pitch
+    return Workspace(np.zeros(size), np.zeros(size // SEGMENT, np.uint8), span, np.empty(size), np.empty(size))
+
+
+@nb.njit(cache=True)
+def _mark(flags, span, per_row, j, low, n):
+    """Mark the segments that n pixels of row j from `low` on lie in."""
+    a = low // SEGMENT
+    b = (low + n - 1) // SEGMENT
+    span[j, 0] = min(span[j, 0], a)
+    span[j, 1] = max(span[j, 1], b)
+    flags[j * per_row + a : j * per_row + b + 1] = 1
+
+
+@nb.njit(cache=True)
+def _mark_sources(o, maps, w):
+    per_row = w.flags.size // o.ny
+    for s in range(o.x.size):
+        peak, ellipse = maps.peak[s], maps.ellipse[s]
+        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
+            low, n = chord(peak, ellipse, j, o.ny, o.nx, o.step)
+            if n > 0:
+                _mark(w.flags, w.span, per_row, j, low, n)
+
+
+@nb.njit(cache=True)
+def _mark_counted(counts, w):
+    """Mark every segment with a pixel in the likelihood: a background that varies must be visited everywhere."""
+    per_row = w.flags.size // w.span.shape[0]
+    for j in range(w.span.shape[0]):
+        for k in range(per_row):
+            if counts.segment_pixels[j * per_row + k] > 0.0:
+                _mark(w.flags, w.span, per_row, j, k * SEGMENT, SEGMENT)
+
+
+@nb.njit(cache=True)
+def _next_run(flags, span, per_row, j, k):
+    """The next marked stretch of row j at or after segment k, as segments [start, stop); start < 0 if there is none."""
+    last = span[j, 1]
+    base = j * per_row
+    while k <= last and flags[base + k] == 0:
+        k += 1
+    if k > last:
+        return -1, -1
+    start = k
+    while k <= last and flags[base + k] != 0:
+        k += 1
+    return start, k
+
+
+@nb.njit(cache=True)
+def _clear(w):
+    per_row = w.flags.size // w.span.shape[0]
+    for j in range(w.span.shape[0]):
+        if w.span[j, 1] >= 0:
+            a = j * per_row + w.span[j, 0]
+            b = j * per_row + w.span[j, 1] + 1
+            w.flags[a:b] = 0
+            w.image[a * SEGMENT : b * SEGMENT] = 0.0
+            w.span[j, 0] = per_row
+            w.span[j, 1] = -1
+
+
+@nb.njit(cache=True)
+def _background_row(background, j, ny):
+    """Coefficients of the background polynomial on row j in powers of u; u, v run from -1 to 1 over the frame."""
+    v = (2 * j - ny + 1) / ny
+    c0 = background[0] + v * (background[2] + v * background[5])
+    return c0, background[1] + v * background[4], background[3]
+
+
+@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+def _poisson_run(image, values, u, step, c0, c1, c2):
+    """Sum of n log(mu) - mu, and the smallest mu, over the unmasked pixels of a stretch."""
+    total = 0.0
+    lowest = 1.0
+    for i in range(image.size):
+        x = u + step * i
+        mu = image[i] + (c0 + x * (c1 + x * c2))
+        n = values[i]
+        term = n * log(max(mu, 1e-300)) - mu
+        total += term if n > LIMIT else 0.0
+        lowest = min(lowest, mu if n > LIMIT else 1.0)
+    return total, lowest
+
+
+@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+def _square_run(image, values, level):
+    """Sum of (n - mu)^2 over the unmasked pixels of a stretch."""
+    total = 0.0
+    for i in range(image.size):
+        d = values[i] - (image[i] + level)
+        total += d * d if values[i] > LIMIT else 0.0
+    return total
+
+
+@nb.njit(cache=True)
+def _log_likelihood(counts, w, background):
+    """Log-likelihood of the workspace's image plus the background; what depends on the counts alone is left out."""
+    ny = w.span.shape[0]
+    per_row = w.flags.size // ny
+    step = 2.0 / counts.nx
+    total, lowest = 0.0, 1.0
+    pixels, rest, squares = counts.pixels, counts.total, counts.squares
+    for j in range(ny):
+        c0, c1, c2 = _background_row(background, j, ny)
+        start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+        while start >= 0:
+            a = (j * per_row + start) * SEGMENT
+            b = (j * per_row + stop) * SEGMENT
+            if counts.kind == POISSON:
+                u = (2 * start * SEGMENT - counts.nx + 1) / counts.nx
+                part, low = _poisson_run(w.image[a:b], counts.values[a:b], u, step, c0, c1, c2)
+                lowest = min(lowest, low)
+            else:
+                part = _square_run(w.image[a:b], counts.values[a:b], c0)
+            total += part
+            for k in range(j * per_row + start, j * per_row + stop):
+                pixels -= counts.segment_pixels[k]
+                rest -= counts.segment_sum[k]
+                squares -= counts.segment_squares[k]
+            start, stop = _next_run(w.flags, w.span, per_row, j, stop)
+    level = background[0]
+    if pixels > 0.0:
+        lowest = min(lowest, level)
+    if lowest <= 0.0 or (counts.kind == GAUSSIAN and level <= 0.0):
+        return -math.inf
+    if counts.kind == GAUSSIAN:
+        total += squares - 2.0 * level * rest + level * level * pixels
+        return -0.5 * total / level - 0.5 * counts.pixels * math.log(2.0 * math.pi * level)
+    if pixels > 0.0:
+        total += rest * math.log(level) - pixels * level
+    return total
+
+
+@nb.njit(cache=True)
+def _footprints(o, maps):
+    """The rows of pixels that every source reaches."""
+    size = 0
+    for s in range(o.x.size):
+        size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
+    first = np.zeros(o.x.size + 1, np.int64)
+    low, count, row = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    start = np.zeros(size + 1, np.int64)
+    i = 0
+    for s in range(o.x.size):
+        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
+            at, n = chord(maps.peak[s], maps.ellipse[s], j, o.ny, o.nx, o.step)
+            if n > 0:
+                low[i], count[i], row[i] = at, n, j
+                start[i + 1] = start[i] + n
+                i += 1
+        first[s + 1] = i
+    return Footprints(first, low[:i], count[:i], start[: i + 1], row[:i])
+
+
+@nb.njit(cache=True)
+def _no_footprints():
+    none = np.empty(0, np.int64)
+    return Footprints(np.zeros(1, np.int64), none, none, np.zeros(1, np.int64), none)
+
+
+@nb.njit(cache=True)
+def _stamps(o, maps, fp, sigma):
+    """Every source's image at unit flux, row after row."""
+    out = np.zeros(fp.start[fp.row.size])
+    work = new_work(o)
+    for s in range(o.x.size):
+        a, b, peak = maps.a[s], maps.b[s], maps.peak[s]
+        for i in range(fp.first[s], fp.first[s + 1]):
+            w = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step - peak[1]
+            t = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step - peak[0]
+            row = out[fp.start[i] : fp.start[i + 1]]
+            add_pixels(row, w, t, a, b, o.offsets, o.weights, o.step, sigma, 1.0, work, o.u_degree, o.d_degree)
+    return out
+
+
+@nb.njit(cache=True)
+def _boxes(fp):
+    """First row, last row + 1, first column, last column + 1 of every footprint."""
+    size = fp.first.size - 1
+    boxes = np.zeros((size, 4), np.int64)
+    for s in range(size):
+        a, b = fp.first[s], fp.first[s + 1]
+        if b > a:
+            boxes[s, 0], boxes[s, 1] = fp.row[a], fp.row[b - 1] + 1
+            boxes[s, 2], boxes[s, 3] = np.min(fp.low[a:b]), np.max(fp.low[a:b] + fp.size[a:b])
+    return boxes
+
+
+@nb.njit(cache=True)
+def _clusters(boxes):
+    """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
+    size = boxes.shape[0]
+    parent = np.arange(size)
+    order = np.argsort(boxes[:, 0], kind="mergesort")
+    for i in range(size):
+        s = order[i]
+        for k in range(i + 1, size):
+            t = order[k]
+            if boxes[t, 0] >= boxes[s, 1]:
+                break
+            if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
+                p, q = s, t
+                while parent[p] != p:
+                    parent[p] = parent[parent[p]]
+                    p = parent[p]
+                while parent[q] != q:
+                    parent[q] = parent[parent[q]]
+                    q = parent[q]
+                parent[max(p, q)] = min(p, q)
+    label = np.empty(size, np.int64)
+    groups = 0
+    for s in range(size):  # a root is the smallest of its group, so it is labelled first
+        p = s
+        while parent[p] != p:
+            p = parent[p]
+        if p == s:
+            label[s] = groups
+            groups += 1
+        else:
+            label[s] = label[p]
+    members = np.argsort(label, kind="mergesort")
+    first = np.zeros(groups + 1, np.int64)
+    for s in range(size):
+        first[label[s] + 1] += 1
+    start = np.zeros(groups + 1, np.int64)
+    for c in range(groups):
+        start[c + 1] = start[c] + first[c + 1] ** 2
+        first[c + 1] += first[c]
+    return Clusters(members, first, start)
+
+
+@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+def _dot(a, b, weight):
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i] * weight[i]
+    return total
+
+
+@nb.njit(cache=True)
+def _gram(fp, boxes, members, stamps, weight, pitch, out):
+    """out[s, t] = sum over pixels of weight K_s K_t, both triangles."""
+    for i in range(members.size):
+        s = members[i]
+        for k in range(i + 1):
+            t = members[k]
+            total = 0.0
+            if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
+                for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+                    p = fp.first[s] + j - boxes[s, 0]
+                    q = fp.first[t] + j - boxes[t, 0]
+                    a = max(fp.low[p], fp.low[q])
+                    b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+                    if a < b:
+                        ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+                        total += _dot(stamps[ps + a : ps + b], stamps[qs + a : qs + b], weight[j * pitch + a : j * pitch + b])
+            out[i, k] = total
+            out[k, i] = total
+
+
+@nb.njit(cache=True)
+def _cholesky(h):
+    """Lower triangle in place; False where the matrix is not positive definite."""
+    for i in range(h.shape[0]):
+        for k in range(i + 1):
+            total = h[i, k]
+            for m in range(k):
+                total -= h[i, m] * h[k, m]
+            if i > k:
+                h[i, k] = total / h[k, k]
+            elif total > 0.0:
+                h[i, i] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@nb.njit(cache=True)
+def _solve(lower, x):
+    """x <- (L L^T)^-1 x, in place."""
+    n = x.size
+    for i in range(n):
+        for m in range(i):
+            x[i] -= lower[i, m] * x[m]
+        x[i] /= lower[i, i]
+    for i in range(n - 1, -1, -1):
+        for m in range(i + 1, n):
+            x[i] -= lower[m, i] * x[m]
+        x[i] /= lower[i, i]
+
+
+@nb.njit(cache=True)
+def _draw(fp, s, stamps, amplitude, pitch, out):
+    """Add amplitude times a source's stamp to an image."""
+    for i in range(fp.first[s], fp.first[s + 1]):
+        at = fp.row[i] * pitch + fp.low[i]
+        target = out[at : at + fp.size[i]]
+        stamp = stamps[fp.start[i] : fp.start[i + 1]]
+        for k in range(stamp.size):
+            target[k] += amplitude * stamp[k]
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _weigh_run(image, values, u, step, c0, c1, c2, score, weight):
+    """score = n/mu - 1 and weight = n/mu^2, zero where masked."""
+    for i in range(image.size):
+        x = u + step * i
+        inverse = 1.0 / (image[i] + (c0 + x * (c1 + x * c2)))
+        n = values[i] if values[i] > LIMIT else 0.0
+        score[i] = n * inverse - (1.0 if values[i] > LIMIT else 0.0)
+        weight[i] = n * inverse * inverse
+
+
+@nb.njit(cache=True)
+def _weigh_footprint(counts, w, fp, s, background, score, weight):
+    """Score and weight of Poisson counts on one source's footprint."""
+    ny = w.span.shape[0]
+    pitch = w.image.size // ny
+    for i in range(fp.first[s], fp.first[s + 1]):
+        c0, c1, c2 = _background_row(background, fp.row[i], ny)
+        u = (2 * fp.low[i] - counts.nx + 1) / counts.nx
+        a = fp.row[i] * pitch + fp.low[i]
+        b = a + fp.size[i]
+        _weigh_run(w.image[a:b], counts.values[a:b], u, 2.0 / counts.nx, c0, c1, c2, score[a:b], weight[a:b])
+
+
+@nb.njit(cache=True)
+def _first_flux(counts, w, fp, s, stamps, background):
+    """Least-squares flux of one source, its neighbours ignored."""
+    ny = w.span.shape[0]
+    pitch = w.image.size // ny
+    above, below = 0.0, 0.0
+    for i in range(fp.first[s], fp.first[s + 1]):
+        c0, c1, c2 = _background_row(background, fp.row[i], ny)
+        for k in range(fp.size[i]):
+            n = counts.values[fp.row[i] * pitch + fp.low[i] + k]
+            if n > LIMIT:
+                u = (2 * (fp.low[i] + k) - counts.nx + 1) / counts.nx
+                stamp = stamps[fp.start[i] + k]
+                above += stamp * (n - (c0 + u * (c1 + u * c2)))
+                below += stamp * stamp
+    return above / below if below > 0.0 else 0.0
+
+
+@nb.njit(cache=True)
+def _profile(counts, w, fp, boxes, clusters, stamps, background, scale, flux, factors):
+    """Fill `flux` with its maximum and `factors` with the Cholesky factors of H; add the sources to the image.
+
+    Returns the log-prior of the fluxes plus the Laplace term, or -inf without a maximum. The prior of flux s is
+    Gamma(2, scale[s]), with density F exp(-F / scale) / scale^2.
+    """
+    pitch = w.image.size // w.span.shape[0]
+    score, weight = w.score, w.weight
+    value = 0.0
+    for c in range(clusters.first.size - 1):
+        members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
+        n = members.size
+        h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
+        step = np.empty(n)
+        for i in range(n):
+            s = members[i]
+            flux[s] = max(_first_flux(counts, w, fp, s, stamps, background), 0.01 * scale[s])
+            _draw(fp, s, stamps, flux[s], pitch, w.image)
+        converged = False
+        for _ in range(100):
+            for i in range(n):
+                _weigh_footprint(counts, w, fp, members[i], background, score, weight)
+            _gram(fp, boxes, members, stamps, weight, pitch, h)
+            for i in range(n):
+                s = members[i]
+                total = 1.0 / flux[s] - 1.0 / scale[s]
+                for k in range(fp.first[s], fp.first[s + 1]):
+                    at = fp.row[k] * pitch + fp.low[k]
+                    for m in range(fp.size[k]):
+                        total += stamps[fp.start[k] + m] * score[at + m]
+                step[i] = total
+                h[i, i] += 1.0 / flux[s] ** 2
+            gradient = step.copy()
+            if not _cholesky(h):
+                break
+            _solve(h, step)
+            decrement = math.sqrt(max(np.dot(gradient, step), 0.0))
+            if decrement <= 1e-9:
+                converged = True
+                break
+            length = 1.0 if decrement < 0.25 else 1.0 / (1.0 + decrement)
+            for i in range(n):
+                s = members[i]
+                after = max(flux[s] + length * step[i], 0.01 * flux[s])
+                _draw(fp, s, stamps, after - flux[s], pitch, w.image)
+                flux[s] = after
+        if not converged:
+            return -math.inf
+        for i in range(n):
+            s = members[i]
+            value += math.log(flux[s] / scale[s] ** 2) - flux[s] / scale[s]
+            value += 0.5 * math.log(2.0 * math.pi) - math.log(h[i, i])
+    return value
+
+
+@nb.njit(cache=True)
+def _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted):
+    """Put all sources into the workspace's image, profiling their fluxes into `fitted` if they are free.
+
+    Returns what the profiling adds to the log-likelihood, and what it knows of the sources: their footprints, boxes,
+    clusters, stamps and Cholesky factors (empty where fluxes are fixed).
+    """
+    _mark_sources(o, maps, w)
+    if counts.varies:
+        _mark_counted(counts, w)
+    sigma = nuisances[3]
+    extra = 0.0
+    fp = _footprints(o, maps) if free else _no_footprints()
+    boxes = _boxes(fp)
+    clusters = _clusters(boxes)
+    stamps = _stamps(o, maps, fp, sigma) if free else np.empty(0)
+    factors = np.empty(clusters.start[-1])
+    if free:
+        extra = _profile(counts, w, fp, boxes, clusters, stamps, background, 0.5 * flux, fitted, factors)
+    else:
+        work = new_work(o)
+        for s in range(o.x.size):
+            fitted[s] = nuisances[0] * flux[s]
+            add_source(o, maps, s, sigma, fitted[s], w.image, work)
+    return extra, fp, boxes, clusters, stamps, factors
+
+
+@nb.njit(cache=True)
+def _log_likelihood_at(o, counts, w, theta, nuisances, background, flux, free):
+    """Log-likelihood for one set of parameters; nuisances are flux_scale, offset_x, offset_y, psf_sigma."""
+    maps = new_maps(o)
+    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
+        return -math.inf
+    value = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, np.empty(flux.size))[0]
+    if value > -math.inf:
+        value += _log_likelihood(counts, w, background)
+    _clear(w)
+    return value
+
+
+@nb.njit(cache=True, nogil=True)
+def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, first, step, out):
+    """Log-likelihoods of rows first, first + step, ... into `out`; rows where it is -inf already are left alone."""
+    for i in range(first, out.size, step):
+        if out[i] > -math.inf:
+            out[i] = _log_likelihood_at(o, counts, w, theta[i], nuisances[i], background[i], flux, free)
+
+
+@nb.njit(cache=True, nogil=True)
+def expected(o, counts, w, theta, nuisances, background, flux, free, fitted, out):
+    """Sources plus background into `out` (ny, padded row), the fluxes into `fitted`; False if a map folds or the fit fails."""
+    maps = new_maps(o)
+    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
+        return False
+    extra = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted)[0]
+    for j in range(o.ny):
+        c0, c1, c2 = _background_row(background, j, o.ny)
+        for i in range(o.nx):
+            u = (2 * i - o.nx + 1) / o.nx
+            out[j, i] = w.image[j * out.shape[1] + i] + (c0 + u * (c1 + u * c2))
+    _clear(w)
+    return extra > -math.inf
+
+
+@nb.njit(cache=True)
+def _weigh(counts, w, background, curve):
+    """Score d log L/d mu and weight -d^2 log L/d mu^2 of every marked pixel; curve = -1/2 d weight/d mu."""
+    ny = w.span.shape[0]
+    per_row = w.flags.size // ny
+    for j in range(ny):
+        c0, c1, c2 = _background_row(background, j, ny)
+        start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+        while start >= 0:
+            for p in range((j * per_row + start) * SEGMENT, (j * per_row + stop) * SEGMENT):
+                u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
+                mu = w.image[p] + c0 + u * (c1 + u * c2)
+                n = counts.values[p]
+                if n <= LIMIT:
+                    w.score[p], w.weight[p], curve[p] = 0.0, 0.0, 0.0
+                elif counts.kind == POISSON:
+                    w.score[p], w.weight[p], curve[p] = n / mu - 1.0, n / (mu * mu), n / (mu * mu * mu)
+                else:
+                    w.score[p], w.weight[p], curve[p] = (n - mu) / c0, 1.0 / c0, 0.0
+            start, stop = _next_run(w.flags, w.span, per_row, j, stop)
+
+
+@nb.njit(cache=True)
+def _laplace_adjoint(w, fp, boxes, clusters, stamps, factors, flux, curve):
+    """z, the stamps q_s and the image A of the module's derivation."""
+    pitch = w.image.size // w.span.shape[0]
+    h, y = np.zeros(w.image.size), np.zeros(w.image.size)
+    z = np.empty(flux.size)
+    mixed = np.zeros(stamps.size)
+    for c in range(clusters.first.size - 1):
+        members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
+        n = members.size
+        lower = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
+        inverse = np.eye(n)
+        for i in range(n):
+            _solve(lower, inverse[i])
+        for i in range(n):
+            s = members[i]
+            for m in range(n):
+                t = members[m]
+                if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
+                    for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+                        p = fp.first[s] + j - boxes[s, 0]
+                        q = fp.first[t] + j - boxes[t, 0]
+                        for k in range(max(fp.low[p], fp.low[q]), min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])):
+                            mixed[fp.start[p] + k - fp.low[p]] += inverse[i, m] * stamps[fp.start[q] + k - fp.low[q]]
+            for p in range(fp.first[s], fp.first[s + 1]):
+                for k in range(fp.size[p]):
+                    at = fp.start[p] + k
+                    h[fp.row[p] * pitch + fp.low[p] + k] += stamps[at] * mixed[at]
+        part = np.empty(n)
+        for i in range(n):
+            s = members[i]
+            total = inverse[i, i] / flux[s] ** 3
+            for p in range(fp.first[s], fp.first[s + 1]):
+                for k in range(fp.size[p]):
+                    at = fp.row[p] * pitch + fp.low[p] + k
+                    total += curve[at] * h[at] * stamps[fp.start[p] + k]
+            part[i] = total
+        _solve(lower, part)
+        for i in range(n):
+            z[members[i]] = part[i]
+            _draw(fp, members[i], stamps, part[i], pitch, y)
+    for j in range(w.span.shape[0]):
+        for p in range(j * pitch + w.span[j, 0] * SEGMENT, j * pitch + (w.span[j, 1] + 1) * SEGMENT):
+            if w.flags[p // SEGMENT]:
+                h[p] = w.score[p] + curve[p] * h[p] - w.weight[p] * y[p]
+    return z, mixed, h
+
+
+@nb.njit(cache=True, nogil=True)
+def gradient(o, counts, w, theta, nuisances, background, flux, free, basis, out, out_background):
+    """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`."""
+    maps = new_maps(o)
+    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
+        return False
+    fitted = np.empty(flux.size)
+    extra, fp, boxes, clusters, stamps, factors = _draw_sources(
+        o, counts, w, maps, nuisances, background, flux, free, fitted
+    )
+    if extra == -math.inf:
+        _clear(w)
+        return False
+    curve = np.empty(w.image.size)
+    _weigh(counts, w, background, curve)
+    image = w.score
+    z, mixed = np.zeros(flux.size), np.empty(0)
+    if free:
+        z, mixed, image = _laplace_adjoint(w, fp, boxes, clusters, stamps, factors, fitted, curve)
+    _background_gradient(counts, w, background, image, out_background)
+    pitch = w.image.size // o.ny
+    work = new_work(o)
+    rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, pitch))
+    samples, powers = np.empty((6, pitch)), np.empty((len(o.u_degree) + 1, pitch))
+    ones, c = np.ones(pitch), np.empty(pitch)
+    moments = np.empty(rows.shape[0])
+    for s in range(o.x.size):
+        moments[:] = 0.0
+        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
+            low, n = chord(maps.peak[s], maps.ellipse[s], j, o.ny, o.nx, o.step)
+            if n == 0:
+                continue
+            at = j * pitch + low
+            for k in range(n):
+                c[k] = fitted[s] * image[at + k]
+            if free:
+                q = fp.start[fp.first[s] + j - boxes[s, 0]]
+                for k in range(n):
+                    c[k] += z[s] * w.score[at + k] - w.weight[at + k] * mixed[q + k]
+            basis_row(o, maps, basis, s, j, low, n, nuisances[3], rows, samples, powers, work)
+            for k in range(moments.size):
+                moments[k] += _dot(rows[k, :n], c[:n], ones[:n])
+        for k in range(basis.row.size):
+            out[k] += basis.lever[s, k] * moments[basis.row[k]]
+    _clear(w)
+    return True
+
+
+@nb.njit(cache=True)
+def _background_gradient(counts, w, background, image, out):
+    """Sum of the image times 1, u, v, u^2, uv, v^2 over the likelihood's pixels."""
+    ny = w.span.shape[0]
+    per_row = w.flags.size // ny
+    pixels, rest = counts.pixels, counts.total
+    for j in range(ny):
+        v = (2 * j - ny + 1) / ny
+        start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+        while start >= 0:
+            for p in range((j * per_row + start) * SEGMENT, (j * per_row + stop) * SEGMENT):
+                if counts.values[p] > LIMIT:
+                    u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
+                    out[0] += image[p]
+                    out[1] += image[p] * u
+                    out[2] += image[p] * v
+                    out[3] += image[p] * u * u
+                    out[4] += image[p] * u * v
+                    out[5] += image[p] * v * v
+            for k in range(j * per_row + start, j * per_row + stop):
+                pixels -= counts.segment_pixels[k]
+                rest -= counts.segment_sum[k]
+            start, stop = _next_run(w.flags, w.span, per_row, j, stop)
+    if pixels > 0.0:
+        out[0] += rest / background[0] - pixels if counts.kind == POISSON else (rest - background[0] * pixels) / background[0]
+
+
+@nb.njit(cache=True)
+def _fisher_weight(counts, w, background):
+    """Expected information 1 / variance per marked pixel into w.weight, zero where masked; returns the unmarked pixels."""
+    ny = w.span.shape[0]
+    per_row = w.flags.size // ny
+    pixels = counts.pixels
+    for j in range(ny):
+        c0, c1, c2 = _background_row(background, j, ny)
+        start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+        while start >= 0:
+            for p in range((j * per_row + start) * SEGMENT, (j * per_row + stop) * SEGMENT):
+                u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
+                mu = w.image[p] + c0 + u * (c1 + u * c2)
+                counted = counts.values[p] > LIMIT
+                w.weight[p] = (1.0 / (mu if counts.kind == POISSON else c0)) if counted else 0.0
+            for k in range(j * per_row + start, j * per_row + stop):
+                pixels -= counts.segment_pixels[k]
+            start, stop = _next_run(w.flags, w.span, per_row, j, stop)
+    return pixels
+
+
+BAND = 16  # rows of the Jacobian held at a time
+
+
+@nb.njit(cache=True, nogil=True)
+def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis, out):
+    """Fisher information of source parameters, then the first `terms` background coefficients, fluxes profiled out.
+
+    I = sum over pixels of J J^T / mu, band by band of rows; with free fluxes the Schur complement
+    I - C I_FF^-1 C^T, where I_FF carries the prior's 1/F^2.
+    """
+    maps = new_maps(o)
+    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
+        return False
+    fitted = np.empty(flux.size)
+    extra, fp, boxes, clusters, stamps, factors = _draw_sources(
+        o, counts, w, maps, nuisances, background, flux, free, fitted
+    )
+    if extra == -math.inf:
+        _clear(w)
+        return False
+    pixels = _fisher_weight(counts, w, background)
+    ny, pitch = o.ny, w.image.size // o.ny
+    per_row = w.flags.size // ny
+    sources = basis.row.size
+    size = sources + terms
+    cross = np.zeros((flux.size, size))
+    band = np.empty((size, BAND, pitch))
+    for top in range(0, ny, BAND):
+        last = min(top + BAND, ny)
+        band[:] = 0.0
+        add_jacobian_rows(o, maps, basis, fitted, nuisances[3], top, last, band)
+        for j in range(top, last):
+            row = band[:, j - top]
+            v = (2 * j - ny + 1) / ny
+            for i in range(pitch):
+                u = (2 * i - o.nx + 1) / o.nx
+                row[sources, i] = 1.0
+                if terms > 1:
+                    row[sources + 1, i], row[sources + 2, i] = u, v
+                if terms > 3:
+                    row[sources + 3, i], row[sources + 4, i], row[sources + 5, i] = u * u, u * v, v * v
+            start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+            while start >= 0:
+                a, b = start * SEGMENT, stop * SEGMENT
+                weight = w.weight[j * pitch + a : j * pitch + b]
+                for k in range(size):
+                    for m in range(k + 1):
+                        out[k, m] += _dot(row[k, a:b], row[m, a:b], weight)
+                start, stop = _next_run(w.flags, w.span, per_row, j, stop)
+        if free:
+            for s in range(flux.size):
+                for j in range(max(top, boxes[s, 0]), min(last, boxes[s, 1])):
+                    i = fp.first[s] + j - boxes[s, 0]
+                    a, b = fp.low[i], fp.low[i] + fp.size[i]
+                    stamp, weight = stamps[fp.start[i] : fp.start[i + 1]], w.weight[j * pitch + a : j * pitch + b]
+                    for k in range(size):
+                        cross[s, k] += _dot(band[k, j - top, a:b], stamp, weight)
+    out[sources, sources] += pixels / background[0] if pixels > 0.0 else 0.0
+    if free:
+        for c in range(clusters.first.size - 1):
+            members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
+            n = members.size
+            h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
+            _gram(fp, boxes, members, stamps, w.weight, pitch, h)
+            for i in range(n):
+                h[i, i] += 1.0 / fitted[members[i]] ** 2
+            if not _cholesky(h):
+                _clear(w)
+                return False
+            column = np.empty(n)
+            for m in range(size):
+                for i in range(n):
+                    column[i] = cross[members[i], m]
+                _solve(h, column)
+                for k in range(m, size):
+                    for i in range(n):
+                        out[k, m] -= cross[members[i], k] * column[i]
+    for k in range(size):
+        for m in range(k):
+            out[m, k] = out[k, m]
+    _clear(w)
+    return True

@@ -1,0 +1,498 @@
+"""The posterior of a field distortion: prior times likelihood of a frame, as functions of a parameter vector.
+
+Parameters are the distortion coefficients, the background and whatever `Nuisances` leaves free. The likelihood and its
+derivatives are in `_kernels.py`; `estimate.py` finds the maximum, `sampling.py` draws.
+"""
+
+import os
+import queue
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy.special import gammaln
+
+from bayesfred.errors import InputError
+from bayesfred.imaging._kernels import SEGMENT, Basis, Optics, stride
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.inference import _kernels, priors
+from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, read_noise_model
+
+Floats = npt.NDArray[np.float64]
+FluxMode = Literal["fixed", "scale", "free"]
+
+BACKGROUND_TERMS = ("background", "background_u", "background_v", "background_u2", "background_uv", "background_v2")
+SOURCE_NUISANCES = ("flux_scale", "offset_x", "offset_y", "psf_sigma")
+
+_pool: ThreadPoolExecutor | None = None
+
+
+def _threads() -> ThreadPoolExecutor:
+    """The threads that share an ensemble's walkers; their number follows numba's setting."""
+    global _pool
+    if _pool is None:
+        _pool = ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, "bayesfred")
+    return _pool
+
+
+def _forget_threads() -> None:
+    global _pool
+    _pool = None
+
+
+os.register_at_fork(after_in_child=_forget_threads)
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """What else is unknown beside the distortion and a constant background.
+
+    Parameters
+    ----------
+    flux : {"fixed", "scale", "free"}
+        Catalogue fluxes are exact; or right but for a common factor, the parameter `flux_scale`; or each is free. Free
+        fluxes are not sampled: the likelihood takes its maximum over them, with the Laplace term, under a prior
+        Gamma(2) whose mean is the catalogue's flux.
+    offset : bool
+        Whether the pointing is unknown: parameters `offset_x`, `offset_y`, pixel, added to every source's position.
+    psf_sigma : bool
+        Whether the PSF's width is unknown: parameter `psf_sigma`, pixel.
+    background_order : {0, 1, 2}
+        Degree of the background polynomial in u and v, which run from -1 to 1 over the frame: parameters
+        `background`, then `background_u`, `background_v`, then `background_u2`, `background_uv`, `background_v2`, counts per pixel.
+    footprint : float or None, pixel
+        Only pixels within this distance of a catalogue position enter the likelihood; for frames with sources that
+        the catalogue lacks.
+
+    Raises
+    ------
+    InputError
+        If a value is not one of those listed.
+
+    Examples
+    --------
+    >>> Nuisances(flux="scale", offset=True).names
+    ('flux_scale', 'offset_x', 'offset_y')
+    """
+
+    flux: FluxMode = "fixed"
+    offset: bool = False
+    psf_sigma: bool = False
+    background_order: int = 0
+    footprint: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.flux not in get_args(FluxMode):
+            raise InputError(f"nuisances: flux: got {self.flux!r}, expected one of {', '.join(get_args(FluxMode))}")
+        if self.background_order not in (0, 1, 2):
+            raise InputError(f"nuisances: background_order: got {self.background_order!r}, expected 0, 1 or 2")
+        if self.footprint is not None and not (np.isfinite(self.footprint) and self.footprint > 0):
+            raise InputError(f"nuisances: footprint: got {self.footprint}, expected a radius in pixels > 0")
+
+    @property
+    def source_names(self) -> tuple[str, ...]:
+        """The nuisance parameters that act on the sources."""
+        free = (self.flux == "scale", self.offset, self.offset, self.psf_sigma)
+        return tuple(name for name, is_free in zip(SOURCE_NUISANCES, free, strict=True) if is_free)
+
+    @property
+    def background_names(self) -> tuple[str, ...]:
+        """The coefficients of the background polynomial."""
+        return BACKGROUND_TERMS[: (1, 3, 6)[self.background_order]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All nuisance parameters but the constant background."""
+        return (*self.source_names, *self.background_names[1:])
+
+    def write(self, group: Any) -> None:
+        """Store the choices in an HDF5 group."""
+        for f in fields(self):
+            value = getattr(self, f.name)
+            group.attrs[f.name] = 0.0 if value is None else value
+
+    @classmethod
+    def read(cls, group: Any) -> "Nuisances":
+        """The choices stored in an HDF5 group by `write`."""
+        a = group.attrs
+        footprint = float(a["footprint"]) or None
+        flux: Any = str(a["flux"])
+        return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), int(a["background_order"]), footprint)
+
+
+def _usable(
+    model: ForwardModel,
+    counts: Floats,
+    mask: npt.ArrayLike | None,
+    noise: PoissonNoise | BackgroundNoise,
+    nuisances: Nuisances,
+) -> npt.NDArray[np.bool_]:
+    """The pixels for the likelihood, after checking that the frame can be explained at all."""
+    shape = model.detector.shape
+    used = np.ones(shape, bool) if mask is None else np.array(mask, dtype=bool)
+    for name, array in (("counts", counts), ("mask", used)):
+        if array.shape != shape:
+            raise InputError(f"{name}: got shape {array.shape}, expected the detector's {shape}")
+    ny, nx = model.detector.fine_shape
+    sources = model.sources
+    if not np.any((np.abs(sources.x) <= 0.5 * nx) & (np.abs(sources.y) <= 0.5 * ny)):
+        raise InputError(
+            f"catalogue: got {len(sources)} sources, all outside the frame of {nx} x {ny} pixels, expected positions in pixels "
+            "from the frame's middle: check the columns, their unit and their origin"
+        )
+    if nuisances.footprint is not None:
+        used &= _footprint(model, nuisances.footprint)
+    if not used.any():
+        raise InputError("counts: every pixel is masked, expected pixels to fit: check the mask and the footprint")
+    n_bad = int(np.sum(used & ~np.isfinite(counts)))
+    if n_bad:
+        raise InputError(f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them")
+    if isinstance(noise, PoissonNoise) and noise.read_noise == 0 and counts[used].min() < 0:
+        raise InputError(
+            f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: check gain and pedestal, give "
+            "read_noise, or mask these pixels"
+        )
+    return used
+
+
+def _footprint(model: ForwardModel, radius: float) -> npt.NDArray[np.bool_]:
+    """Pixels within `radius` of a source's catalogue position."""
+    u, v = model.detector.pixel_centres()
+    inside = np.zeros((v.size, u.size), bool)
+    for x, y in zip(model.sources.x, model.sources.y, strict=True):
+        across, along = np.abs(u - x) <= radius, np.abs(v - y) <= radius
+        inside[np.ix_(along, across)] |= (u[across] - x) ** 2 + (v[along, None] - y) ** 2 <= radius**2
+    return inside
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Posterior:
+    """Posterior of distortion, background and nuisances given a frame.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    counts : array_like, shape (ny, nx), counts
+    prior : mapping of str to frozen scipy.stats distribution, optional
+        By parameter name; the others get `priors.default_prior`. Parameters are independent a priori. A distortion that
+        leaves a source without an image, or folds it, has probability zero.
+    noise : PoissonNoise or BackgroundNoise
+    mask : array_like of bool, shape (ny, nx), optional
+        True where a pixel is to be used.
+    nuisances : Nuisances
+
+    Attributes
+    ----------
+    counts : ndarray, shape (ny, nx), counts; 0 where masked
+    mask : ndarray of bool, shape (ny, nx)
+        Pixels in the likelihood: those asked for, within the footprint.
+
+    Raises
+    ------
+    InputError
+        If the frame does not fit the detector, holds values that no noise model explains, every pixel is masked, no source
+        lies in the frame, or a prior is unusable.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
+    ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
+    >>> posterior = bf.Posterior(model, bf.simulate(model, [1e-4], 2.0, seed=1))
+    >>> posterior.parameter_names
+    ('f_ux', 'background')
+    """
+
+    model: ForwardModel
+    counts: Floats
+    prior: Mapping[str, Any]
+    noise: PoissonNoise | BackgroundNoise
+    mask: npt.NDArray[np.bool_]
+    nuisances: Nuisances
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        counts: npt.ArrayLike,
+        *,
+        prior: Mapping[str, Any] | None = None,
+        noise: PoissonNoise | BackgroundNoise = PoissonNoise(),
+        mask: npt.ArrayLike | None = None,
+        nuisances: Nuisances = Nuisances(),
+    ) -> None:
+        if isinstance(noise, BackgroundNoise) and (nuisances.flux == "free" or nuisances.background_order):
+            raise InputError(
+                "noise: got BackgroundNoise with free fluxes or a varying background, expected fixed or scaled fluxes and "
+                "background_order 0: use PoissonNoise"
+            )
+        frame = np.array(counts, dtype=np.float64)
+        used = _usable(model, frame, mask, noise, nuisances)
+        for name, value in (
+            ("model", model),
+            ("counts", np.where(used, frame, 0.0)),
+            ("noise", noise),
+            ("mask", used),
+            ("nuisances", nuisances),
+        ):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "prior", self._complete(dict(prior or {})))
+
+    def _complete(self, given: dict[str, Any]) -> dict[str, Any]:
+        """The given priors checked, the default ones added."""
+        unknown = sorted(set(given) - set(self.parameter_names))
+        if unknown:
+            raise InputError(f"prior: got {', '.join(unknown)}, expected names among {', '.join(self.parameter_names)}")
+        for name, distribution in given.items():
+            priors.check(name, distribution)
+        m = self.model
+        level = max(float(np.mean(self.counts[self.mask])), 1.0 / self.mask.sum())
+        for name in self.parameter_names:
+            if name not in given:
+                given[name] = priors.default_prior(name, m.distortion, m.detector, level, m.psf.sigma)
+        return {name: given[name] for name in self.parameter_names}
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of every parameter vector."""
+        return (*self.model.distortion.names, "background", *self.nuisances.names)
+
+    @property
+    def n_parameters(self) -> int:
+        """Length of a parameter vector."""
+        return len(self.parameter_names)
+
+    def log_prob(self, params: npt.ArrayLike) -> Any:
+        """Log-posterior density up to the evidence; the likelihood is normalised.
+
+        Parameters
+        ----------
+        params : array_like, shape (d,) or (n, d)
+
+        Returns
+        -------
+        float or ndarray, shape (n,)
+            -inf outside the prior's support.
+
+        Raises
+        ------
+        InputError
+            If a parameter vector has another length.
+        """
+        vectors = self._vectors(params)
+        out = self.log_prior(vectors)
+        out[np.isnan(out)] = -np.inf
+        prior = out.copy()
+        arguments = self._arguments(vectors)
+        threads = min(numba.get_num_threads(), len(vectors))
+
+        def evaluate(first: int) -> None:
+            self._use(lambda w: _kernels.log_likelihoods(
+                self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out))  # fmt: skip
+
+        if threads == 1:
+            evaluate(0)
+        else:
+            list(_threads().map(evaluate, range(threads)))
+        out += np.where(np.isfinite(out), prior + self._constant, 0.0)
+        out[np.isnan(out)] = -np.inf
+        return float(out[0]) if np.ndim(params) == 1 else out
+
+    def log_prior(self, params: npt.ArrayLike) -> Floats:
+        """Log-density of the prior for parameter vectors of shape (n, d)."""
+        vectors = self._vectors(params)
+        total = np.zeros(len(vectors))
+        for k, distribution in enumerate(self.prior.values()):
+            total += distribution.logpdf(vectors[:, k])
+        return total
+
+    def gradient(self, params: npt.ArrayLike) -> Floats:
+        """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
+        vector = self._vectors(params)[0]
+        arguments = [a[0] for a in self._arguments(vector[None])]
+        sources, background = np.zeros(self._basis.row.size), np.zeros(6)
+        ok = self._use(lambda w: _kernels.gradient(
+            self._optics, self._frame, w, *arguments, self._flux, self._free, self._basis, sources, background))  # fmt: skip
+        if not ok:
+            return np.full(vector.size, np.nan)
+        if isinstance(self.noise, BackgroundNoise):
+            level = arguments[2][0]
+            residual = self.counts - self.expected_counts(vector)
+            squares = float(np.sum(residual[self.mask] ** 2))
+            background[0] += 0.5 * (squares / level - self._frame.pixels) / level
+        out = self._gather(sources, background)
+        if self.nuisances.flux == "scale":
+            out[self.parameter_names.index("flux_scale")] /= arguments[1][0]
+        out += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
+        return out
+
+    def fisher(self, params: npt.ArrayLike) -> Floats:
+        """Fisher information of the frame about the parameters, free fluxes profiled out; without the prior.
+
+        Returns
+        -------
+        ndarray, shape (d, d); NaN outside the prior's support
+        """
+        vector = self._vectors(params)[0]
+        arguments = [a[0] for a in self._arguments(vector[None])]
+        terms = len(self.nuisances.background_names)
+        size = self._basis.row.size + terms
+        out = np.zeros((size, size))
+        ok = self._use(lambda w: _kernels.fisher(
+            self._optics, self._frame, w, *arguments, terms, self._flux, self._free, self._basis, out))  # fmt: skip
+        if not ok:
+            return np.full(out.shape, np.nan)
+        if isinstance(self.noise, BackgroundNoise):
+            k = self._basis.row.size
+            out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
+        if self.nuisances.flux == "scale":
+            k = len(self.model.distortion.names)
+            out[k] /= arguments[1][0]
+            out[:, k] /= arguments[1][0]
+        return out[np.ix_(self._order, self._order)]
+
+    def information(self, params: npt.ArrayLike) -> Floats:
+        """Fisher information plus the prior's curvature: the inverse is the Laplace approximation's covariance."""
+        vector = self._vectors(params)[0]
+        curvature = [max(priors.slope(p, x)[1], 0.0) for p, x in zip(self.prior.values(), vector, strict=True)]
+        return self.fisher(vector) + np.diag(curvature)
+
+    def expected_counts(self, params: npt.ArrayLike) -> Floats:
+        """Expected counts of every pixel, free fluxes at their most likely values; NaN where a map folds.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx), counts per pixel
+        """
+        return self._expected(params)[0]
+
+    def fluxes(self, params: npt.ArrayLike) -> Floats:
+        """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
+        return self._expected(params)[1]
+
+    def _expected(self, params: npt.ArrayLike) -> tuple[Floats, Floats]:
+        vector = self._vectors(params)[0]
+        arguments = [a[0] for a in self._arguments(vector[None])]
+        ny, nx = self.model.detector.shape
+        fluxes, out = np.empty(self._flux.size), np.empty((ny, stride(nx)))
+        ok = self._use(lambda w: _kernels.expected(
+            self._optics, self._frame, w, *arguments, self._flux, self._free, fluxes, out))  # fmt: skip
+        if not ok:
+            out[:] = np.nan
+        return out[:, :nx] - self.noise.shift, fluxes
+
+    def start(self) -> Floats:
+        """Parameters to begin a search from: no distortion, the frame's median as background, nuisances as given."""
+        median = float(np.median(self.counts[self.mask]))
+        level = median if median > 0 else max(0.1 * float(np.mean(self.counts[self.mask])), 1e-6)
+        known = {"background": level, "flux_scale": 1.0, "psf_sigma": self.model.psf.sigma}
+        return np.array([known.get(name, 0.0) for name in self.parameter_names])
+
+    def _vectors(self, params: npt.ArrayLike) -> Floats:
+        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
+        if vectors.ndim != 2 or vectors.shape[1] != self.n_parameters:
+            raise InputError(
+                f"params: got shape {np.shape(params)}, expected ({self.n_parameters},) or (n, {self.n_parameters}) for "
+                + ", ".join(self.parameter_names)
+            )
+        return vectors
+
+    def _arguments(self, vectors: Floats) -> tuple[Floats, Floats, Floats]:
+        """Distortion coefficients, source nuisances and background coefficients, one row a parameter vector."""
+        column = {name: vectors[:, k] for k, name in enumerate(self.parameter_names)}
+        n = len(vectors)
+        fixed = {"flux_scale": 1.0, "psf_sigma": self.model.psf.sigma}
+        nuisances = np.stack([column.get(name, np.full(n, fixed.get(name, 0.0))) for name in SOURCE_NUISANCES], axis=1)
+        background = np.stack([column.get(name, np.zeros(n)) for name in BACKGROUND_TERMS], axis=1)
+        background[:, 0] += self.noise.shift
+        return np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]), nuisances, background
+
+    def _gather(self, sources: Floats, background: Floats) -> Floats:
+        terms = len(self.nuisances.background_names)
+        return np.concatenate([sources, background[:terms]])[self._order]
+
+    def _use(self, function: Callable[[_kernels.Workspace], Any]) -> Any:
+        """Call a function with a workspace that no other thread uses meanwhile."""
+        try:
+            workspace = self._workspaces.get_nowait()
+        except queue.Empty:
+            ny, nx = self.model.detector.shape
+            workspace = _kernels.new_workspace(ny, stride(nx))
+        result = function(workspace)
+        self._workspaces.put(workspace)
+        return result
+
+    @cached_property
+    def _workspaces(self) -> "queue.SimpleQueue[_kernels.Workspace]":
+        return queue.SimpleQueue()
+
+    @cached_property
+    def _order(self) -> list[int]:
+        """Where each parameter stands among source parameters followed by background coefficients."""
+        kernel = (*self.model.distortion.names, *self.nuisances.source_names, *self.nuisances.background_names)
+        return [kernel.index(name) for name in self.parameter_names]
+
+    @cached_property
+    def _optics(self) -> Optics:
+        narrowest = self.prior["psf_sigma"].ppf(1e-6) if self.nuisances.psf_sigma else None
+        return self.model.optics(narrowest)
+
+    @cached_property
+    def _basis(self) -> Basis:
+        return self.model.basis(self.nuisances.source_names)
+
+    @property
+    def _flux(self) -> Floats:
+        return self.model.sources.flux
+
+    @property
+    def _free(self) -> bool:
+        return self.nuisances.flux == "free"
+
+    @cached_property
+    def _frame(self) -> _kernels.Counts:
+        ny, nx = self.model.detector.shape
+        values = np.full((ny, stride(nx)), _kernels.MASKED)
+        values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, _kernels.MASKED)
+        used = (values > _kernels.LIMIT).reshape(-1, SEGMENT)
+        clean = np.where(used, values.reshape(-1, SEGMENT), 0.0)
+        total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
+        return _kernels.Counts(
+            values.ravel(), used.sum(axis=1).astype(float), total, squares,
+            float(used.sum()), float(total.sum()), float(squares.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
+        )  # fmt: skip
+
+    @cached_property
+    def _constant(self) -> float:
+        """The part of the log-likelihood that depends on the counts alone."""
+        if isinstance(self.noise, BackgroundNoise):
+            return 0.0
+        return -float(np.sum(gammaln(np.maximum(self.counts[self.mask] + self.noise.shift, 0.0) + 1.0)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def write(self, group: Any) -> None:
+        """Store frame, mask, model, noise, nuisances and priors in an HDF5 group."""
+        group.create_dataset("counts", data=self.counts, fletcher32=True)
+        group.create_dataset("mask", data=self.mask, fletcher32=True)
+        for name in ("model", "noise", "nuisances"):
+            getattr(self, name).write(group.create_group(name))
+        priors.write(self.prior, group.create_group("prior"))
+
+    @classmethod
+    def read(cls, group: Any) -> "Posterior":
+        """The posterior stored in an HDF5 group by `write`."""
+        return cls(
+            ForwardModel.read(group["model"]),
+            group["counts"][()],
+            prior=priors.read(group["prior"]),
+            noise=read_noise_model(group["noise"]),
+            mask=group["mask"][()],
+            nuisances=Nuisances.read(group["nuisances"]),
+        )

@@ -1,0 +1,261 @@
+"""Whole runs from a run file: build the posterior, fit, sample, judge, report.
+
+`cli.py` is the same from a shell. Settings become objects here, and nowhere else.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from bayesfred import files, settings
+from bayesfred.analysis.diagnostics import Diagnostics, diagnose
+from bayesfred.errors import InputError
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.imaging.scene import SourceCatalog
+from bayesfred.inference import priors
+from bayesfred.inference.chainfile import Chain, open_chain
+from bayesfred.inference.estimate import find_map
+from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
+from bayesfred.inference.posterior import Nuisances, Posterior
+from bayesfred.inference.sampling import sample
+from bayesfred.reporting import html, plots
+
+Floats = npt.NDArray[np.float64]
+PathLike = str | os.PathLike[str]
+
+DEMO_NOTE = (
+    "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian PSF of 10 pixels. The "
+    "coefficients are those of its Table 2, read with g in y and the columns in the order u2x, v2x, ux, vx, ux2, vx2: the "
+    "reading in which the paper's results are possible."
+)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a finished run left.
+
+    Attributes
+    ----------
+    chain : Chain
+    diagnostics : Diagnostics
+    """
+
+    chain: Chain
+    diagnostics: Diagnostics
+
+
+def demo(folder: PathLike, *, seed: int = 1, overwrite: bool = False) -> Result:
+    """Simulate the frame of the example run file, which is the paper's, and fit it into folder/demo.h5.
+
+    Parameters
+    ----------
+    folder : path-like
+        Made if it does not exist.
+    seed : int
+        Seed of the frame and of the sampler.
+    overwrite : bool
+        Replace an earlier demo.
+    """
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    example = Path(__file__).with_name("example.toml")
+    run = settings.read_settings(example)
+    run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
+    posterior, truth = _simulated(run, example, seed)
+    return _fit(posterior, Path(folder) / "demo.h5", run, "demo", [DEMO_NOTE], truth=truth, overwrite=overwrite)
+
+
+def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
+    """Draw the frame that a run file's [simulation] describes, and write it and its source grid, if it has one."""
+    run = settings.read_settings(Path(run_file))
+    if run.simulation is None:
+        raise InputError(f"{run_file}: simulation: no such section, expected shape, theta and background: see bayesfred fit --help")
+    if run.frame.gain is not None or run.frame.pedestal != 0.0:
+        raise InputError(
+            f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts are written: leave them out"
+        )
+    posterior, _ = _simulated(run, Path(run_file), run.simulation.seed)
+    if run.simulation.grid is not None:
+        s = posterior.model.sources
+        catalogue = settings.resolve(run.catalogue.path, Path(run_file))
+        files.write_catalogue(catalogue, files.CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite)
+        print(f"{catalogue}: {len(s)} sources")
+    frame = settings.resolve(run.frame.path, Path(run_file))
+    files.write_frame(frame, posterior.counts, overwrite=overwrite)
+    ny, nx = posterior.counts.shape
+    print(f"{frame}: {nx} x {ny} pixels, {posterior.counts.sum():.0f} counts")
+
+
+def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) -> Result:
+    """Fit the frame of a run file: MAP, draws, diagnostics, report.
+
+    Parameters
+    ----------
+    run_file : path-like
+        TOML, see `bayesfred fit --help`.
+    resume : bool
+        Go on with the run in the output file.
+    overwrite : bool
+        Replace the output file.
+    """
+    run_file = Path(run_file)
+    run = settings.read_settings(run_file)
+    f = run.frame
+    frame = files.read_frame(
+        settings.resolve(f.path, run_file, must_exist=True), gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
+    )
+    print(frame.description)
+    ny, nx = frame.counts.shape
+    posterior = _posterior(run, _model(run, (ny, nx), _sources(run, run_file)), frame.counts, frame.valid)
+    output = Path(run.output.path) if run.output.path else Path("chains") / f"{run_file.stem}.h5"
+    if run.output.path is None:
+        output.parent.mkdir(exist_ok=True)
+    return _fit(posterior, output, run, run_file.stem, [frame.description], resume=resume, overwrite=overwrite)
+
+
+def report(chain_file: PathLike, *, target_ess: float = 1000.0) -> Result:
+    """Judge a chain file anew, and write its report and overview beside it."""
+    chain = open_chain(chain_file)
+    return _report(chain, chain.posterior(), Path(chain_file).stem, [], target_ess=target_ess)
+
+
+def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:
+    """A simulated frame's posterior and the true parameters."""
+    s = run.simulation
+    assert s is not None, "checked by the callers"
+    sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux) if s.grid else _sources(run, run_file)
+    model = _model(run, s.shape, sources)
+    unknown = sorted(set(s.theta) - set(model.distortion.names))
+    if unknown:
+        raise InputError(
+            f"{run_file}: simulation.theta: got {', '.join(unknown)}, expected names among {', '.join(model.distortion.names)}"
+        )
+    theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
+    noise = _noise(run)
+    counts = simulate(model, theta, s.background, seed=seed, noise=noise)
+    posterior = _posterior(run, model, counts, None)
+    known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
+    known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
+    return posterior, np.array([known.get(name, 0.0) for name in posterior.parameter_names])
+
+
+def _sources(run: settings.RunSettings, run_file: Path) -> SourceCatalog:
+    c = run.catalogue
+    path = settings.resolve(c.path, run_file, must_exist=True)
+    record = files.read_catalogue(path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point)
+    return SourceCatalog(record.x, record.y, record.flux)
+
+
+def _model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog) -> ForwardModel:
+    d = run.distortion
+    if d.terms is None:
+        distortion = PolynomialDistortion(d.f_terms or (), d.g_terms or ())
+    elif d.degree is not None:
+        distortion = PolynomialDistortion.complete(d.degree)
+    else:
+        distortion = getattr(PolynomialDistortion, d.terms)()
+    detector = Detector(shape, binning=run.detector.binning, pixel=run.detector.pixel)
+    m = run.model
+    return ForwardModel(
+        detector, sources, GaussianPSF(run.psf.sigma), distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance
+    )
+
+
+def _noise(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
+    return BackgroundNoise() if run.noise.kind == "background" else PoissonNoise(run.noise.read_noise)
+
+
+def _posterior(
+    run: settings.RunSettings, model: ForwardModel, counts: Floats, mask: npt.NDArray[np.bool_] | None
+) -> Posterior:
+    n = run.nuisances
+    nuisances = Nuisances(n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint)
+    prior = {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
+    return Posterior(model, counts, prior=prior, noise=_noise(run), mask=mask, nuisances=nuisances)
+
+
+def _fit(
+    posterior: Posterior,
+    output: Path,
+    run: settings.RunSettings,
+    title: str,
+    notes: Sequence[str],
+    *,
+    truth: Floats | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Result:
+    """Find the maximum, sample, report."""
+    s = run.sampling
+    if output.exists() and not (overwrite or resume):  # said before the work, not after it
+        raise InputError(f"{output}: exists, expected a new file: go on with --resume, or replace it with --overwrite")
+    estimate = None
+    if not (resume and output.exists()):
+        with Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)"):
+            estimate = find_map(posterior)
+        print(f"maximum: {estimate.message}")
+    chain = sample(
+        posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
+        target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
+    )  # fmt: skip
+    return _report(chain, posterior, title, notes, target_ess=s.target_ess, truth=truth, run=run)
+
+
+def _report(
+    chain: Chain,
+    posterior: Posterior,
+    title: str,
+    notes: Sequence[str],
+    *,
+    target_ess: float,
+    truth: Floats | None = None,
+    run: settings.RunSettings | None = None,
+) -> Result:
+    """Table on the screen, page and picture beside the chain."""
+    diagnostics = diagnose(chain, target_ess=target_ess)
+    # a file or a pipe has no width of its own
+    Console(width=None if sys.stdout.isatty() else 120).print(_table(chain, diagnostics, truth))
+    page = html.write_report(
+        chain.path.with_suffix(".html"), title=title, chain=chain, diagnostics=diagnostics, posterior=posterior, truth=truth,
+        notes=notes, settings=run.model_dump_json(indent=2) if run else None,
+    )  # fmt: skip
+    picture = chain.path.with_suffix(".png")
+    expected = posterior.expected_counts(chain.estimate.params)
+    figure = plots.overview(posterior.counts, expected, posterior.mask, chain.draws(), chain.parameter_names, truth=truth)
+    figure.savefig(picture, dpi=150)
+    print(f"{diagnostics.message}\nchain   {chain.path}\nreport  {page}\npicture {picture}")
+    return Result(chain, diagnostics)
+
+
+def _table(chain: Chain, diagnostics: Diagnostics, truth: Floats | None) -> Table:
+    """Coefficient, truth, MAP, posterior mean +- sd, z, and how well it is sampled."""
+    table = Table()
+    heads = ("MAP", "posterior mean +- sd") if truth is None else ("truth", "MAP", "posterior mean +- sd", "z")
+    for head in ("coefficient", *heads, "R-hat", "ESS"):
+        table.add_column(head, justify="left" if head == "coefficient" else "right", no_wrap=True)
+    draws = chain.draws()
+    for k, name in enumerate(chain.parameter_names):
+        mean, sd = float(draws[:, k].mean()), float(draws[:, k].std(ddof=1))
+        exponent = int(np.floor(np.log10(max(abs(mean), sd)))) if sd > 0 else 0
+        exponent = 0 if -3 < exponent < 4 else exponent
+        places = max(0, exponent + 1 - int(np.floor(np.log10(sd)))) if sd > 0 else 6
+
+        def number(value: float, exponent: int = exponent, places: int = places) -> str:
+            return f"{value / 10.0**exponent:.{places}f}"
+
+        power = f" e{exponent:+03d}" if exponent else ""
+        cells = [number(chain.estimate.params[k]) + power, f"{number(mean)} ± {number(sd)}{power}"]
+        if truth is not None:
+            cells = [number(truth[k]) + power, *cells, f"{(mean - truth[k]) / sd:+.2f}"]
+        ess = min(diagnostics.ess_bulk[name], diagnostics.ess_tail[name])
+        table.add_row(name, *cells, f"{diagnostics.rhat[name]:.3f}", f"{ess:.0f}")
+    return table

@@ -1,0 +1,309 @@
+"""The run file: defaults, every refusal in one line, and where files are looked up."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from bayesfred.errors import InputError
+from bayesfred import settings
+from bayesfred.settings import PriorSettings, RunSettings, read_settings, resolve
+
+EXAMPLE = Path(settings.__file__).with_name("example.toml").read_text(encoding="utf-8")
+
+SECTIONS = {
+    "frame": 'path = "frame.fits"',
+    "catalogue": 'path = "stars.csv"',
+    "psf": "sigma = 2",
+    "distortion": 'terms = "mirrored"',
+}
+
+
+def read(folder: Path, text: str = "", **sections: str) -> RunSettings:
+    """Read a run file that has the sections every one needs, those given in their place, and more text."""
+    body = "\n".join(f"[{name}]\n{keys}" for name, keys in {**SECTIONS, **sections}.items())
+    path = folder / "run.toml"
+    path.write_text(f"{body}\n{text}\n", encoding="utf-8")
+    return read_settings(path)
+
+
+def message(folder: Path, text: str = "", **sections: str) -> str:
+    """Return what follows the file's name in the one line that refuses a run file."""
+    with pytest.raises(InputError) as caught:
+        read(folder, text, **sections)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith(f"{folder / 'run.toml'}: ")
+    return line.removeprefix(f"{folder / 'run.toml'}: ")
+
+
+def is_section(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def test_defaults(tmp_path: Path) -> None:
+    settings = read(tmp_path)
+    assert settings.model_dump(exclude_none=True) == {
+        "frame": {"path": "frame.fits", "pedestal": 0.0},
+        "catalogue": {"path": "stars.csv", "x": "x", "y": "y", "flux": "flux"},
+        "detector": {"pixel": "impulse", "binning": 1},
+        "psf": {"sigma": 2.0},
+        "distortion": {"terms": "mirrored"},
+        "model": {"conserve_flux": True, "tolerance": 1e-8},
+        "noise": {"kind": "poisson", "read_noise": 0.0},
+        "nuisances": {"flux": "fixed", "offset": False, "psf_sigma": False, "background_order": 0},
+        "prior": {},
+        "sampling": {"seed": 1, "ensembles": 4, "walkers": 32, "target_ess": 1000},
+        "output": {},
+    }
+
+
+def test_example(tmp_path: Path) -> None:
+    assert max(map(len, EXAMPLE.splitlines())) < 90
+    path = tmp_path / "run.toml"
+    path.write_text(EXAMPLE, encoding="utf-8")
+    settings = read_settings(path)
+    assert settings.simulation is not None
+    assert settings.simulation.grid is not None
+    assert settings.simulation.shape == (505, 505)
+    assert settings.simulation.grid.model_dump() == {"side": 9, "spacing": 50.0, "flux": 1e5}
+    assert settings.simulation.theta["g_vy2"] == -1e-6
+    assert len(settings.simulation.theta) == 8
+    # What it shows as usual is the default.
+    for name in ("detector", "model", "noise", "nuisances", "sampling", "output"):
+        assert getattr(settings, name) == RunSettings.model_fields[name].default
+
+
+def test_example_names_every_key(tmp_path: Path) -> None:
+    lines = EXAMPLE.splitlines()
+    text = "\n".join(re.sub(r"^# (?=\w+ = |\[)", "", line) for line in lines)
+    table = tomllib.loads(text)
+    assert set(table) == set(RunSettings.model_fields)
+    for name, field in RunSettings.model_fields.items():
+        section = next(kind for kind in (field.annotation, *get_args(field.annotation)) if is_section(kind))
+        assert name == "prior" or set(table[name]) == set(section.model_fields)
+    # All of them at once, but for the keys that exclude others, are a run file.
+    path = tmp_path / "run.toml"
+    path.write_text(re.sub(r"(?m)^(degree|[fg]_terms) = ", "# ", text))
+    settings = read_settings(path)
+    assert settings.prior["f_ux"].keywords == {"loc": 0.0, "scale": 1e-5}
+    assert settings.catalogue.zero_point == 25.0
+
+
+def test_everything_is_kept_as_json(tmp_path: Path) -> None:
+    settings = read(
+        tmp_path,
+        '[prior.f_ux]\ndistribution = "norm"\nloc = 0\nscale = 1e-6\n'
+        "[simulation]\nshape = [10, 20]\ntheta = {f_ux = 1e-4}\nbackground = 0\n",
+        distortion="f_terms = [[1, 0, 1, 0]]\ng_terms = [[0, 1, 0, 1], [0, 1, 2, 0]]",
+    )
+    assert settings.distortion.g_terms == ((0, 1, 0, 1), (0, 1, 2, 0))
+    assert settings.prior["f_ux"].distribution == "norm"
+    assert settings.prior["f_ux"].keywords == {"loc": 0.0, "scale": 1e-6}
+    again = RunSettings.model_validate_json(settings.model_dump_json())
+    assert again == settings
+    assert again.model_dump_json() == settings.model_dump_json()
+
+
+def test_settings_are_frozen(tmp_path: Path) -> None:
+    settings = read(tmp_path)
+    with pytest.raises(ValidationError, match="frozen"):
+        settings.psf.sigma = 3.0
+    with pytest.raises(ValidationError, match="frozen"):
+        PriorSettings(distribution="norm").distribution = "cauchy"
+
+
+@pytest.mark.parametrize(
+    ("section", "keys", "expected"),
+    [
+        ("frame", "gain = 2", "frame.path: missing, expected a value"),
+        ("frame", "path = 3", "frame.path: got 3, expected a valid string"),
+        ("frame", 'path = ""', "frame.path: got '', expected one with at least 1 character"),
+        ("frame", 'path = "a"\ngain = 0', "frame.gain: got 0, expected a number greater than 0"),
+        ("frame", 'path = "a"\ngain = "2"', "frame.gain: got '2', expected a valid number"),
+        ("frame", 'path = "a"\ngain = true', "frame.gain: got True, expected a valid number"),
+        ("frame", 'path = "a"\npedestal = inf', "frame.pedestal: got inf, expected a finite number"),
+        ("frame", 'path = "a"\nsaturation = nan', "frame.saturation: got nan, expected a finite number"),
+        ("frame", 'path = "a"\npedestel = 1', "frame.pedestel: unknown key, did you mean 'pedestal'?"),
+        (
+            "psf",
+            "sigma = 2\nqqq = 1",
+            "psf.qqq: unknown key, expected one of sigma",
+        ),
+        ("psf", "sigma = -1.5", "psf.sigma: got -1.5, expected a number greater than 0"),
+        (
+            "catalogue",
+            'path = "a"\nmagnitude = "m"',
+            "catalogue: got magnitude alone, expected magnitude and zero_point together",
+        ),
+        ("catalogue", 'path = "a"\nzero_point = 25', "catalogue: got zero_point alone"),
+        ("detector", 'pixel = "square"', "detector.pixel: got 'square', expected 'impulse' or 'box'"),
+        ("detector", "binning = 0", "detector.binning: got 0, expected a number greater than or equal to 1"),
+        ("detector", "binning = 1.5", "detector.binning: got 1.5, expected a valid integer"),
+        ("distortion", "", "distortion: got no terms, expected either terms, or both f_terms and g_terms"),
+        ("distortion", "f_terms = [[1, 0, 0, 0]]", "distortion: got f_terms, expected either"),
+        (
+            "distortion",
+            'terms = "paper"\nf_terms = [[1, 0, 0, 0]]\ng_terms = []',
+            "distortion: got terms and f_terms and g_terms, expected either",
+        ),
+        ("distortion", "f_terms = []\ng_terms = []", "distortion: got f_terms and g_terms empty"),
+        ("distortion", 'terms = "complete"', "distortion: got no degree"),
+        (
+            "distortion",
+            'terms = "complete"\ndegree = 1',
+            "distortion.degree: got 1, expected a number greater",
+        ),
+        ("distortion", 'terms = "paper"\ndegree = 3', "distortion: got degree 3"),
+        ("distortion", 'terms = "papers"', "distortion.terms: got 'papers', expected 'mirrored', 'paper'"),
+        (
+            "distortion",
+            "f_terms = [[1, 0, 0]]\ng_terms = []",
+            "distortion.f_terms.0.3: missing, expected a value",
+        ),
+        (
+            "distortion",
+            "f_terms = [[1, 0, 0, -1]]\ng_terms = []",
+            "distortion.f_terms.0.3: got -1, expected a number greater than or equal to 0",
+        ),
+        (
+            "distortion",
+            "f_terms = [[1, 0, 0, 0, 0]]\ng_terms = []",
+            "distortion.f_terms.0: got [1, 0, 0, 0, 0], expected one with at most 4 items",
+        ),
+        ("model", "tolerance = 1.0", "model.tolerance: got 1.0, expected a number less than 1"),
+        ("model", "tolerance = -1e-9", "model.tolerance: got -1e-09, expected a number greater than or"),
+        ("model", "conserve_flux = 1", "model.conserve_flux: got 1, expected a valid boolean"),
+        ("noise", 'kind = "gauss"', "noise.kind: got 'gauss', expected 'poisson' or 'background'"),
+        ("noise", "read_noise = -1", "noise.read_noise: got -1, expected a number greater than or equal"),
+        ("noise", 'kind = "background"\nread_noise = 2.0', "noise: got read_noise 2.0"),
+        ("nuisances", 'flux = "none"', "nuisances.flux: got 'none', expected 'fixed', 'scale' or 'free'"),
+        ("nuisances", "background_order = 3", "nuisances.background_order: got 3, expected 0, 1 or 2"),
+        ("nuisances", "footprint = 0.0", "nuisances.footprint: got 0.0, expected a number greater than 0"),
+        ("nuisances", 'offset = "yes"', "nuisances.offset: got 'yes', expected a valid boolean"),
+        ("prior", "f_ux = 3", "prior.f_ux: got 3, expected a table"),
+        ("prior.f_ux", "scale = 1", "prior.f_ux.distribution: missing, expected a value"),
+        (
+            "prior.f_ux",
+            'distribution = "norm"\nscale = "1"',
+            "prior.f_ux.scale: got '1', expected a valid number",
+        ),
+        (
+            "prior.f_ux",
+            'distribution = "norm"\nscale = inf',
+            "prior.f_ux.scale: got inf, expected a finite number",
+        ),
+        (
+            "sampling",
+            "ensembles = 1",
+            "sampling.ensembles: got 1, expected a number greater than or equal to 2",
+        ),
+        ("sampling", "walkers = 2", "sampling.walkers: got 2, expected a number greater than or equal to 4"),
+        ("sampling", "walkers = 7", "sampling.walkers: got 7, expected a multiple of 2"),
+        ("sampling", "target_ess = 0", "sampling.target_ess: got 0"),
+        ("sampling", "steps = 0", "sampling.steps: got 0"),
+        ("sampling", "seed = -1", "sampling.seed: got -1"),
+        ("output", 'file = "a.h5"', "output.file: unknown key"),
+        ("simulation", "theta = {}\nbackground = 1", "simulation.shape: missing, expected a value"),
+        ("simulation", "shape = [0, 5]\ntheta = {}\nbackground = 1", "simulation.shape.0: got 0"),
+        ("simulation", "shape = [5, 5, 5]\ntheta = {}\nbackground = 1", "simulation.shape: got [5, 5, 5]"),
+        (
+            "simulation",
+            "shape = [5, 5]\ntheta = {f_ux = nan}\nbackground = 1",
+            "simulation.theta.f_ux: got nan",
+        ),
+        ("simulation", "shape = [5, 5]\ntheta = {}\nbackground = -1", "simulation.background: got -1"),
+        (
+            "simulation",
+            "shape = [5, 5]\ntheta = {}\nbackground = 1\ngrid = {side = 2, spacing = 5, flu = 1}",
+            "simulation.grid.flux: missing, expected a value; "
+            "simulation.grid.flu: unknown key, did you mean 'flux'?",
+        ),
+        ("simulate", "seed = 1", "simulate: unknown key, did you mean 'simulation'?"),
+        ("'a\\nb'", "seed = 1", "a\\nb: unknown key, expected one of frame, catalogue"),
+    ],
+)
+def test_refusals(tmp_path: Path, section: str, keys: str, expected: str) -> None:
+    assert expected in message(tmp_path, **{section: keys})
+
+
+def test_a_missing_section_and_several_mistakes(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text(
+        'frame = 3\n[catalogue]\npath = "a"\n[psf]\nsigma = 0\n[distortion]\nterms = "paper"\n["x\\ny"]\n'
+    )
+    with pytest.raises(InputError) as caught:
+        read_settings(path)
+    assert str(caught.value).startswith(
+        f"{path}: frame: got 3, expected a table; psf.sigma: got 0, expected a number greater than 0; "
+        "x y: unknown key, expected one of frame"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("key", "not TOML (Expected '=' after a key in a key/value pair (at line "),
+        ("[psf]", "not TOML (Cannot declare ('psf',) twice (at line "),
+        (f"deep = {'[' * 300}{']' * 300}", "nested too deeply"),
+        (f"deep = {'[' * 20000}{']' * 20000}", "nested too deeply"),
+        (f"{'a.' * 2000}b = 1", "nested too deeply"),
+        (f"big = {'1' * 5000}", "not TOML"),
+    ],
+)
+def test_text_that_is_not_a_run_file(tmp_path: Path, text: str, expected: str) -> None:
+    assert expected in message(tmp_path, text)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no\.toml: no such file, expected a run file"):
+        read_settings(tmp_path / "no.toml")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_settings(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
+    with pytest.raises(InputError, match=r"latin\.toml: not TOML \('utf-8' codec"):
+        read_settings(tmp_path / "latin.toml")
+
+
+def test_byte_order_mark_and_line_ends(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + EXAMPLE.replace("\n", "\r\n").encode())
+    assert read_settings(path).psf.sigma == 10.0
+
+
+def test_resolve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs, data = tmp_path / "runs", tmp_path / "data"
+    runs.mkdir()
+    data.mkdir()
+    run_file = runs / "run.toml"
+    (runs / "both.fits").touch()
+    (data / "both.fits").touch()
+    (data / "data.fits").touch()
+    monkeypatch.delenv("BAYESFRED_DATA", raising=False)
+    assert resolve("both.fits", run_file) == runs / "both.fits"
+    assert resolve("data.fits", run_file) == runs / "data.fits"
+    monkeypatch.setenv("BAYESFRED_DATA", str(data))
+    assert resolve("both.fits", run_file) == runs / "both.fits"
+    assert resolve("data.fits", run_file, must_exist=True) == data / "data.fits"
+    assert resolve("none.fits", run_file) == runs / "none.fits"
+    assert resolve(data / "data.fits", run_file) == data / "data.fits"
+    assert resolve(str(data / "none.fits"), run_file) == data / "none.fits"
+
+
+def test_resolve_says_where_it_looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_file = tmp_path / "run.toml"
+    monkeypatch.setenv("BAYESFRED_DATA", str(tmp_path / "data"))
+    with pytest.raises(InputError) as caught:
+        resolve("no.fits", run_file, must_exist=True)
+    assert str(caught.value) == (
+        f"{run_file}: got 'no.fits', expected a file at {tmp_path / 'no.fits'} or "
+        f"{tmp_path / 'data' / 'no.fits'}; "
+        "check the path or set BAYESFRED_DATA to the folder that holds it"
+    )
+    with pytest.raises(InputError, match=r"check the path$"):
+        resolve(tmp_path / "no.fits", run_file, must_exist=True)
