@@ -10,8 +10,8 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from bayesfred.errors import InputError
 from bayesfred import settings
+from bayesfred.errors import InputError
 from bayesfred.settings import PriorSettings, RunSettings, read_settings, resolve
 
 EXAMPLE = Path(settings.__file__).with_name("example.toml").read_text(encoding="utf-8")

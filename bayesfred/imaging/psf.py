@@ -30,8 +30,8 @@ class GaussianPSF:
 
     Examples
     --------
-    >>> GaussianPSF(10.0).peak
-    0.0015915494309189536
+    >>> round(GaussianPSF(10.0).peak, 9)
+    0.001591549
     """
 
     sigma: float
