@@ -14,7 +14,7 @@ import sys
 import textwrap
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
@@ -31,6 +31,7 @@ from bayesfred import files
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.cli import app
 from bayesfred.inference.chainfile import Chain, open_chain
+from bayesfred.inference.posterior import Posterior
 from bayesfred.settings import read_settings
 
 ROOT = Path(__file__).parents[1]
@@ -381,7 +382,7 @@ REFUSALS = [
     Refusal("missing output folder", sections(output='path = "absent/run.h5"'), ("run.h5", "no folder absent")),
     Refusal("no simulation", content("run.toml", run_text().split("[simulation]")[0]), ("run.toml", "simulation"), SIMULATE),
     Refusal("unknown true term", sections(**{"simulation.theta": "f_zz = 1"}), ("run.toml", "simulation.theta", "f_zz"), SIMULATE),
-    Refusal("simulated files exist", unchanged, ("stars.csv", "exists", "--overwrite"), ("simulate", "run.toml")),
+    Refusal("simulated files exist", unchanged, ("exists", "--overwrite"), ("simulate", "run.toml")),
     Refusal("missing chain", unchanged, ("absent.h5", "no such file"), ("report", "absent.h5")),
     Refusal("no chain", unchanged, ("frame.fits", "HDF5"), ("report", "frame.fits")),
 ]
@@ -451,17 +452,6 @@ def test_more_parameters_than_the_frame_determines(folder: Path) -> None:
     assert named < mirrored
 
 
-def damage(change: Callable[[Path], None]) -> Prepare:
-    """Make a chain, then damage it."""
-
-    def prepare(folder: Path) -> None:
-        sections(sampling=FEW_STEPS)(folder)
-        assert invoke(folder, "fit", "run.toml").code == 3
-        change(folder / "run.h5")
-
-    return prepare
-
-
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 
@@ -491,8 +481,10 @@ DAMAGED = pytest.mark.xfail(reason="a damaged dataset or group is not refused bu
 @pytest.mark.parametrize(
     "change", [cut, change_schema, pytest.param(flip_a_byte, marks=DAMAGED), pytest.param(drop_an_ensemble, marks=DAMAGED)]
 )
-def test_damaged_chain(change: Callable[[Path], None], folder: Path) -> None:
-    check_refusal(Refusal("", damage(change), ("run.h5",), ("report", "run.h5")), folder)
+def test_damaged_chain(change: Callable[[Path], None], finished: tuple[Path, Output], tmp_path: Path) -> None:
+    shutil.copy(finished[0] / "run.h5", tmp_path)
+    change(tmp_path / "run.h5")
+    assert names_a_file(check_refusal(Refusal("", unchanged, ("run.h5",), ("report", "run.h5")), tmp_path))
 
 
 @pytest.mark.xfail(reason="a scale that is not positive is taken, and the search finds no density")
@@ -547,9 +539,10 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes], 
         time.sleep(0.02)
 
 
-@pytest.fixture
-def interrupted(folder: Path) -> Iterator[tuple[Path, int, str]]:
-    """A run of very many steps that got a Ctrl-C once it had made some: folder, exit code, standard error."""
+@pytest.fixture(scope="module")
+def interrupted(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, list[str]]:
+    """A run of very many steps that got a Ctrl-C once it had made some: folder, exit code, lines on standard error."""
+    folder = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("interrupted") / "here"))
     sections(sampling="steps = 100000")(folder)
     # the progress bar counts steps on standard error, also in a file if it takes that for a terminal
     env = environment(FORCE_COLOR="1", TERM="xterm", COLUMNS="120")
@@ -563,18 +556,23 @@ def interrupted(folder: Path) -> Iterator[tuple[Path, int, str]]:
     finally:
         process.kill()
         process.wait()
-    yield folder, code, re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", log.read_text(encoding="utf-8"))
+    return folder, code, messages(log.read_text(encoding="utf-8"))
 
 
-def test_ctrl_c_saves_the_steps(interrupted: tuple[Path, int, str]) -> None:
+def messages(text: str) -> list[str]:
+    """Lines on standard error that are not progress."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # colours
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "\n", text)  # what moves the cursor
+    progress = re.compile(r"\s*|. searching for .*|sampling [━╸╺ ]+ (\d+ steps )?[\d:. -]*")
+    return [line for line in text.splitlines() if not progress.fullmatch(line)]
+
+
+def test_ctrl_c_saves_the_steps(interrupted: tuple[Path, int, list[str]]) -> None:
     """The run can be read, and goes on to the very draws that it would have made without the interruption."""
-    folder, code, stderr = interrupted
+    folder, code, lines = interrupted
     assert code == 130
-    assert "Traceback" not in stderr
-    lines = [line for line in stderr.splitlines() if "sampling" not in line.split(";")[0][:10] and "bayesfred" in line]
-    assert len(lines) == 1
-    assert lines[0].startswith("bayesfred: interrupted; ")
-    assert "--resume" in lines[0]
+    assert lines[-1].startswith("bayesfred: interrupted; ")
+    assert "--resume" in lines[-1]
 
     stopped = open_chain(folder / "run.h5")
     steps = stopped.chain.shape[1]
@@ -587,13 +585,33 @@ def test_ctrl_c_saves_the_steps(interrupted: tuple[Path, int, str]) -> None:
     assert resumed.chain.shape[1] == steps + 8
     np.testing.assert_array_equal(resumed.chain[:, :steps], stopped.chain)
 
-    if steps > 2000:  # a fast machine: do not repeat what takes long
-        return
     sections(sampling=f"steps = {steps + 8}", output='path = "unbroken.h5"')(folder)
     assert invoke(folder, "fit", "run.toml").code in (0, 3)
     unbroken = open_chain(folder / "unbroken.h5")
     np.testing.assert_array_equal(unbroken.chain, resumed.chain)
     np.testing.assert_array_equal(unbroken.log_prob, resumed.log_prob)
+    np.testing.assert_array_equal(unbroken.accepted, resumed.accepted)
+
+
+@pytest.mark.xfail(reason="emcee prints a traceback of its own where an interrupt meets a likelihood")
+def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ensembles take turns, two calls a step; the 30th call, the first four being the walkers' places, is in the fourth step."""
+    log_prob = Posterior.log_prob
+    calls = 0
+
+    def stop(posterior: Posterior, params: NDArray[np.float64]) -> object:
+        nonlocal calls
+        calls += np.ndim(params) == 2
+        if calls == 30:
+            raise KeyboardInterrupt
+        return log_prob(posterior, params)
+
+    monkeypatch.setattr(Posterior, "log_prob", stop)
+    output = invoke(folder, "fit", "run.toml")
+    assert output.code == 130
+    assert open_chain(folder / "run.h5").chain.shape[1] == 3
+    assert len(messages(output.stderr)) == 1
+    assert "Traceback" not in output.stdout
 
 
 def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -655,7 +673,7 @@ def test_simulate_leaves_the_data_folder_alone(simulated: Path, tmp_path: Path) 
     data, here = tmp_path / "data", tmp_path / "here"
     shutil.copytree(simulated, data)
     here.mkdir()
-    sections(**{"simulation": "shape = [60, 75]\nbackground = 3.0\nseed = 2"})(here)
+    sections(simulation="shape = [60, 75]\nbackground = 3.0\nseed = 2")(here)
     before = snapshot(data)
     assert invoke(here, "simulate", "run.toml", "--overwrite", data=data).code == 0
     assert snapshot(data) == before

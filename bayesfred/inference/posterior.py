@@ -188,7 +188,7 @@ class Posterior:
 
     Attributes
     ----------
-    counts : ndarray, shape (ny, nx), counts; 0 where masked
+    counts : ndarray, shape (ny, nx), counts; 0 where not finite
     mask : ndarray of bool, shape (ny, nx)
         Pixels in the likelihood: those asked for, within the footprint.
 
@@ -235,7 +235,7 @@ class Posterior:
         used = _usable(model, frame, mask, noise, nuisances)
         for name, value in (
             ("model", model),
-            ("counts", np.where(used, frame, 0.0)),
+            ("counts", np.where(np.isfinite(frame), frame, 0.0)),
             ("noise", noise),
             ("mask", used),
             ("nuisances", nuisances),

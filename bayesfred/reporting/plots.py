@@ -244,7 +244,7 @@ def frame_triptych(counts: Floats, expected: Floats, mask: Mask) -> Figure:
     ----------
     counts, expected : ndarray, shape (ny, nx), counts per pixel
     mask : ndarray of bool, shape (ny, nx)
-        True where a pixel enters the likelihood; the others are grey in frame and residual.
+        True where a pixel enters the likelihood; the others are grey in the residual, and in the frame if they are empty.
 
     Returns
     -------
@@ -293,7 +293,7 @@ def star_panels(
     if not shown.size:
         fig.text(0.5, 0.5, "no source lies in the frame", ha="center", va="center")
         return fig
-    used, sigma = np.where(mask, counts, np.nan), _residual(counts, expected, mask)
+    used, sigma = _recorded(counts, mask), _residual(counts, expected, mask)
     width, height = fig.get_size_inches()
     outer = fig.add_gridspec(
         1, blocks, left=0.01, right=1 - 0.75 / width, bottom=0.01, top=1 - 0.42 / height, wspace=0.06
@@ -378,7 +378,7 @@ def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: 
     ny, nx = counts.shape
     extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
     norm = _stretch(counts[mask], expected[mask])
-    _show(axes[0], np.where(mask, counts, np.nan), norm, "viridis", extent)
+    _show(axes[0], _recorded(counts, mask), norm, "viridis", extent)
     _show(axes[1], expected, norm, "viridis", extent)
     # inset axes are exactly as high as the image beside them
     bar = fig.colorbar(
@@ -407,6 +407,11 @@ def _show(
     cmap: Colormap = colormaps[colours].with_extremes(bad=MASKED)
     image = np.ma.masked_invalid(frame)
     return ax.imshow(image, cmap=cmap, norm=norm, extent=extent, origin="lower", interpolation="nearest")
+
+
+def _recorded(counts: Floats, mask: Mask) -> Floats:
+    """The frame, nan where a pixel was masked because it holds no counts."""
+    return np.where(mask | (counts != 0.0), counts, np.nan)
 
 
 def _residual(counts: Floats, expected: Floats, mask: Mask) -> Floats:
