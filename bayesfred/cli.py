@@ -61,7 +61,9 @@ def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> 
 @app.command()
 def report(
     chain_file: Annotated[Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)],
-    target_ess: Annotated[float, typer.Option(min=1, help="Effective draws to ask of every parameter.")] = 1000.0,
+    target_ess: Annotated[
+        float | None, typer.Option(min=1, help="Effective draws to ask of every parameter.", show_default="the run's")
+    ] = None,
 ) -> None:
     """Judge a chain file anew and write its report, .html and .png, beside it."""
     _run(lambda: bf.runs.report(chain_file, target_ess=target_ess))

@@ -65,8 +65,20 @@ def demo(folder: PathLike, *, seed: int = 1, overwrite: bool = False) -> Result:
         Seed of the frame and of the sampler.
     overwrite : bool
         Replace an earlier demo.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made, or holds a demo already.
     """
-    Path(folder).mkdir(parents=True, exist_ok=True)
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made a folder ({error.strerror}), expected a place for the demo's files") from None
     example = Path(__file__).with_name("example.toml")
     run = settings.read_settings(example)
     run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
@@ -75,7 +87,19 @@ def demo(folder: PathLike, *, seed: int = 1, overwrite: bool = False) -> Result:
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
-    """Draw the frame that a run file's [simulation] describes, and write it and its source grid, if it has one."""
+    """Draw the frame that a run file's [simulation] describes, and write it and its source grid, if it has one.
+
+    Parameters
+    ----------
+    run_file : path-like
+    overwrite : bool
+        Replace frame and catalogue.
+
+    Raises
+    ------
+    InputError
+        If there is no [simulation], it cannot be drawn, or a file exists.
+    """
     run = settings.read_settings(Path(run_file))
     if run.simulation is None:
         raise InputError(f"{run_file}: simulation: no such section, expected shape, theta and background: see bayesfred fit --help")
@@ -84,15 +108,17 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
             f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts are written: leave them out"
         )
     posterior, _ = _simulated(run, Path(run_file), run.simulation.seed)
+    # written beside the run file, whatever lies in the data folder
+    frame, catalogue = Path(run_file).parent / run.frame.path, Path(run_file).parent / run.catalogue.path
+    if frame.exists() and not overwrite:  # before the catalogue is written
+        raise InputError(f"{frame}: exists, expected a new file: rename it, or replace it with --overwrite")
     if run.simulation.grid is not None:
         s = posterior.model.sources
-        catalogue = settings.resolve(run.catalogue.path, Path(run_file))
         files.write_catalogue(catalogue, files.CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite)
         print(f"{catalogue}: {len(s)} sources")
-    frame = settings.resolve(run.frame.path, Path(run_file))
     files.write_frame(frame, posterior.counts, overwrite=overwrite)
     ny, nx = posterior.counts.shape
-    print(f"{frame}: {nx} x {ny} pixels, {posterior.counts.sum():.0f} counts")
+    print(f"{frame}: {ny} x {nx} pixels, {posterior.counts.sum():.0f} counts")
 
 
 def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) -> Result:
@@ -106,6 +132,15 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
         Go on with the run in the output file.
     overwrite : bool
         Replace the output file.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the run file, the frame or the catalogue is unusable, or the output file exists.
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
@@ -115,17 +150,32 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     )
     print(frame.description)
     ny, nx = frame.counts.shape
-    posterior = _posterior(run, _model(run, (ny, nx), _sources(run, run_file)), frame.counts, frame.valid)
+    sources = _sources(run, run_file)
+    try:
+        posterior = _posterior(run, _model(run, (ny, nx), sources), frame.counts, frame.valid)
+    except InputError as error:
+        raise InputError(f"{run_file}: {error}") from None
     output = Path(run.output.path) if run.output.path else Path("chains") / f"{run_file.stem}.h5"
     if run.output.path is None:
         output.parent.mkdir(exist_ok=True)
     return _fit(posterior, output, run, run_file.stem, [frame.description], resume=resume, overwrite=overwrite)
 
 
-def report(chain_file: PathLike, *, target_ess: float = 1000.0) -> Result:
-    """Judge a chain file anew, and write its report and overview beside it."""
+def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
+    """Judge a chain file anew, and write its report and overview beside it.
+
+    Parameters
+    ----------
+    chain_file : path-like
+    target_ess : float, optional
+        Effective draws to ask of every parameter; by default as many as the run was made for.
+
+    Returns
+    -------
+    Result
+    """
     chain = open_chain(chain_file)
-    return _report(chain, chain.posterior(), Path(chain_file).stem, [], target_ess=target_ess)
+    return _report(chain, chain.posterior(), Path(chain_file).stem, [], target_ess=target_ess or chain.target_ess)
 
 
 def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:
@@ -145,7 +195,10 @@ def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Po
     posterior = _posterior(run, model, counts, None)
     known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
     known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
-    return posterior, np.array([known.get(name, 0.0) for name in posterior.parameter_names])
+    truth = np.array([known.get(name, 0.0) for name in posterior.parameter_names])
+    if not np.all(np.isfinite(posterior.expected_counts(truth))):
+        raise InputError(f"{run_file}: simulation.theta: got a distortion that folds a source's image, expected a weaker one")
+    return posterior, truth
 
 
 def _sources(run: settings.RunSettings, run_file: Path) -> SourceCatalog:
@@ -196,6 +249,10 @@ def _fit(
 ) -> Result:
     """Find the maximum, sample, report."""
     s = run.sampling
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite: got both, expected one: go on with the run, or replace it")
+    if not output.parent.is_dir():
+        raise InputError(f"{output}: no folder {output.parent}, expected one to write the chain to: create it")
     if output.exists() and not (overwrite or resume):  # said before the work, not after it
         raise InputError(f"{output}: exists, expected a new file: go on with --resume, or replace it with --overwrite")
     estimate = None
@@ -253,7 +310,7 @@ def _table(chain: Chain, diagnostics: Diagnostics, truth: Floats | None) -> Tabl
             return f"{value / 10.0**exponent:.{places}f}"
 
         power = f" e{exponent:+03d}" if exponent else ""
-        cells = [number(chain.estimate.params[k]) + power, f"{number(mean)} ± {number(sd)}{power}"]
+        cells = [number(chain.estimate.params[k]) + power, f"{number(mean)} +- {number(sd)}{power}"]
         if truth is not None:
             cells = [number(truth[k]) + power, *cells, f"{(mean - truth[k]) / sd:+.2f}"]
         ess = min(diagnostics.ess_bulk[name], diagnostics.ess_tail[name])

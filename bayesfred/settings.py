@@ -270,7 +270,7 @@ class OutputSettings(_Section):
         The chain file, .h5.
     """
 
-    path: _Name | None = None
+    path: Annotated[str, Field(pattern=r"\.h5$")] | None = None
 
 
 class GridSettings(_Section):

@@ -55,8 +55,10 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
         "1.5 pixels it covers. The posterior knows photon noise alone, so its errors are too small by about that factor,\n"
         "which the last column allows for."
     )
-    verdict = "agree within 3 such errors" if worst < 3 else "do not all agree: a single frame's stars sample the corners, where x^3\nand y^3 are fixed, too thinly"
-    print(f"Posterior and centroids {verdict}.")
+    if worst < 3:
+        print("Posterior and centroids agree within 3 such errors.")
+    else:
+        print("Posterior and centroids do not all agree: few of one frame's stars are in the corners that fix x^3 and y^3.")
 
 
 def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float]:

@@ -428,7 +428,6 @@ def test_public_names_are_documented(name: str) -> None:
     assert undocumented(SOURCES[defined_in(name)], name) == []
 
 
-@pytest.mark.xfail(reason="Returns is missing, or Parameters and Raises")
 @pytest.mark.parametrize("name", ["demo", "fit", "report", "simulate_frame"])
 def test_runs_are_documented(name: str) -> None:
     assert undocumented(SOURCES["bayesfred.runs"], name) == []

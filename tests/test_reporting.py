@@ -150,7 +150,7 @@ def test_page_without_truth_or_notes(tmp_path: Path) -> None:
 
 
 def test_page_of_an_unconverged_chain_says_why(tmp_path: Path) -> None:
-    chain, posterior = run()
+    chain, _ = run()
     chain.chain[0] += 1e-7
     text, page = report(tmp_path, chain=chain, diagnostics=diagnose(chain))
     assert "not converged: R-hat" in page.text and 'class="verdict bad"' in text

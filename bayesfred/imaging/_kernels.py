@@ -6,7 +6,7 @@ For one source the displacement is a polynomial in (u, v) alone, so the kernel's
 
 are two small coefficient matrices. They are expanded about the source's peak, where a = b = 0, which makes
 them well conditioned and gives the window of pixels to visit. Along a row of pixels they are polynomials in u
-alone, and so is the Jacobian determinant D = a_u b_v - a_v b_u: a sample of the kernel costs three Horner
+alone, and so are a^2 + b^2 and the Jacobian determinant D = a_u b_v - a_v b_u: a sample of the kernel costs two Horner
 sweeps and one exponential. The degree in u reaches the innermost loop as the length of a tuple, that is as a
 compile-time constant, so that the loop over pixels vectorises for every degree.
 
@@ -25,11 +25,12 @@ from numba.extending import intrinsic
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-# Reassociation is left out where a result's last digits matter: it would undo the two-part range reduction of exp.
+# Reassociation is left out where a result's last digits matter: it would undo the range reduction of exp2.
 FAST = {"contract", "arcp", "nsz", "nnan", "ninf"}
 REDUCE = FAST | {"reassoc"}
 
 LANES = 8  # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
+LOG2_E = 1.4426950408889634
 SEGMENT = 16  # pixels that are marked together as reached by a source
 
 
@@ -49,7 +50,9 @@ class Optics(NamedTuple):
     nx: int
     cut: float  # -2 log(tolerance)
     v_degree: int
+    ramp: Floats  # (padded row,) u of pixels counted from a row's first
     u_degree: tuple[int, ...]  # its length is the degree in u of a and b
+    q_degree: tuple[int, ...]  # of a^2 + b^2
     d_degree: tuple[int, ...]  # its length is the degree in u of D; empty where flux is not conserved
 
 
@@ -89,27 +92,28 @@ def as_bits(typingctx: Any, value: Any) -> Any:
 
 
 @nb.njit(fastmath=FAST, inline="always")
-def exp(x):
-    """exp(x) for -700 <= x <= 700 to 2.3e-16 relative: x = n log 2 + r, a polynomial of degree 13 in r, 2^n by its bits."""
-    x = min(max(x, -700.0), 700.0)
-    n = math.floor(x * 1.4426950408889634 + 0.5)
-    r = x - n * 6.93147180369123816490e-01
-    r = r - n * 1.90821492927058770002e-10
-    p = 1.0 / 6227020800.0
-    p = p * r + 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
-    return p * as_float((nb.int64(n) + 1023) << 52)
+def exp2(x):
+    """2^x for -1000 <= x < 1000 to 3e-16 relative, smaller x being taken for -1000.
+
+    x = n + f with n the nearest integer, which adding 1.5 * 2^52 leaves in the sum's lowest bits; the polynomial of degree 11
+    that is nearest to 2^f on [-1/2, 1/2] (Remez, 3e-18 relative); n added to the exponent's bits.
+    """
+    x = max(x, -1000.0)
+    shifted = x + 6755399441055744.0
+    f = x - (shifted - 6755399441055744.0)
+    p = 4.4352827069572771511e-10
+    p = p * f + 7.0741056135081427963e-09
+    p = p * f + 1.0178198021671930844e-07
+    p = p * f + 1.321543308967639918e-06
+    p = p * f + 1.5252733489988525649e-05
+    p = p * f + 1.5403530462514432062e-04
+    p = p * f + 1.3333558146789921722e-03
+    p = p * f + 9.6181291075883352443e-03
+    p = p * f + 5.5504108664819921605e-02
+    p = p * f + 2.4022650695910156204e-01
+    p = p * f + 6.9314718055994533046e-01
+    p = p * f + 1.0
+    return as_float(as_bits(p) + (as_bits(shifted) << 52))
 
 
 @nb.njit(cache=True)
@@ -267,10 +271,9 @@ def chord(peak, ellipse, j, ny, nx, step):
 
 
 @nb.njit(cache=True, fastmath=FAST)
-def _row(a, b, w, ra, rb, rav, rbv, rd, u_degree, d_degree):
-    """Coefficients in t = u - u_peak of a, b, a_v, b_v and D on the row at v = v_peak + w."""
-    size = len(u_degree) + 1
-    for m in range(size):
+def _row(a, b, w, ra, rb, rav, rbv, u_degree):
+    """Coefficients in t = u - u_peak of a, b, a_v and b_v on the row at v = v_peak + w."""
+    for m in range(len(u_degree) + 1):
         pa, pb, pav, pbv = 0.0, 0.0, 0.0, 0.0
         for k in range(a.shape[1]):
             n = a.shape[1] - 1 - k
@@ -279,45 +282,56 @@ def _row(a, b, w, ra, rb, rav, rbv, rd, u_degree, d_degree):
             pa = pa * w + a[m, n]
             pb = pb * w + b[m, n]
         ra[m], rb[m], rav[m], rbv[m] = pa, pb, pav, pbv
+
+
+@nb.njit(cache=True, fastmath=FAST)
+def _row_products(ra, rb, rav, rbv, k, amplitude, rq, rd, u_degree, q_degree, d_degree):
+    """Coefficients in t of the exponent k (a^2 + b^2) and of amplitude times D (of amplitude alone, without D)."""
+    size = len(u_degree) + 1
+    for p in range(len(q_degree) + 1):
+        q = 0.0
+        for m in range(size):
+            if 0 <= p - m < size:
+                q += ra[m] * ra[p - m] + rb[m] * rb[p - m]
+        rq[p] = k * q
+    rd[0] = amplitude
     if len(d_degree) > 0:
         for p in range(len(d_degree) + 1):
             d = 0.0
             for m in range(1, size):
                 if 0 <= p + 1 - m < size:
                     d += m * (ra[m] * rbv[p + 1 - m] - rb[m] * rav[p + 1 - m])
-            rd[p] = d
-    else:
-        rd[0] = 1.0
+            rd[p] = amplitude * d
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _add_row(row, t0, step, ra, rb, rd, k, amplitude, u_degree, d_degree):
-    """row[i] += amplitude exp(k (a^2 + b^2)) |D| at t = t0 + i step."""
-    top = len(u_degree)
+def _add_row(row, ramp, t0, rq, rd, q_degree, d_degree):
+    """row[i] += 2^q(t) |d(t)| at t = t0 + ramp[i], q and d given by their coefficients."""
+    q_top = len(q_degree)
     d_top = len(d_degree)
     for i in range(row.size):
-        t = t0 + step * i
-        a = ra[top]
-        b = rb[top]
-        for m in range(top):
-            a = a * t + ra[top - 1 - m]
-            b = b * t + rb[top - 1 - m]
+        t = t0 + ramp[i]
+        q = rq[q_top]
+        for m in range(q_top):
+            q = q * t + rq[q_top - 1 - m]
         d = rd[d_top]
         for m in range(d_top):
             d = d * t + rd[d_top - 1 - m]
-        row[i] += amplitude * exp(k * (a * a + b * b)) * abs(d)
+        row[i] += exp2(q) * abs(d)
 
 
 @nb.njit(cache=True, inline="always")
-def add_pixels(row, w, t, a, b, offsets, weights, step, sigma, amplitude, work, u_degree, d_degree):
+def add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, amplitude, work, u_degree, q_degree, d_degree):
     """Add a source's counts to a row of pixels whose first centre is (t, w) from the peak."""
-    ra, rb, rav, rbv, rd = work[0], work[1], work[2], work[3], work[4]
-    k = -0.5 / (sigma * sigma)
+    ra, rb, rav, rbv, rq, rd = work[0], work[1], work[2], work[3], work[4], work[5]
+    k = -0.5 * LOG2_E / (sigma * sigma)
     norm = amplitude / (2.0 * math.pi * sigma * sigma)
     for q in range(offsets.size):
-        _row(a, b, w + offsets[q], ra, rb, rav, rbv, rd, u_degree, d_degree)
+        _row(a, b, w + offsets[q], ra, rb, rav, rbv, u_degree)
         for p in range(offsets.size):
-            _add_row(row, t + offsets[p], step, ra, rb, rd, k, norm * weights[q] * weights[p], u_degree, d_degree)
+            weight = norm * weights[q] * weights[p]
+            _row_products(ra, rb, rav, rbv, k, weight, rq, rd, u_degree, q_degree, d_degree)
+            _add_row(row, ramp, t + offsets[p], rq, rd, q_degree, d_degree)
 
 
 @nb.njit(cache=True)
@@ -325,7 +339,7 @@ def add_source(o, maps, s, sigma, flux, out, work):
     """Add source s to the padded, flattened image `out`."""
     # What the rows share is taken out of the tuples once: handing them on costs more than a short row.
     a, b, peak, ellipse = maps.a[s], maps.b[s], maps.peak[s], maps.ellipse[s]
-    offsets, weights, step, ny, nx = o.offsets, o.weights, o.step, o.ny, o.nx
+    offsets, weights, step, ny, nx, ramp = o.offsets, o.weights, o.step, o.ny, o.nx, o.ramp
     pitch = out.size // ny
     for j in range(maps.rows[s, 0], maps.rows[s, 1]):
         low, n = chord(peak, ellipse, j, ny, nx, step)
@@ -334,7 +348,7 @@ def add_source(o, maps, s, sigma, flux, out, work):
             w = (j - 0.5 * (ny - 1)) * step - peak[1]
             t = (low - 0.5 * (nx - 1)) * step - peak[0]
             row = out[start : start + n]
-            add_pixels(row, w, t, a, b, offsets, weights, step, sigma, flux, work, o.u_degree, o.d_degree)
+            add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, flux, work, o.u_degree, o.q_degree, o.d_degree)
 
 
 @nb.njit(cache=True)
@@ -348,7 +362,7 @@ def new_maps(o):
 @nb.njit(cache=True)
 def new_work(o):
     """Room for a row's polynomials."""
-    return np.empty((5, 2 * len(o.u_degree) + 2))
+    return np.empty((6, 2 * len(o.u_degree) + 2))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -383,7 +397,7 @@ def _gradient_row(o, n, t0, u0, ra, rb, rav, rbv, sigma, weight, samples, powers
     """
     top = len(o.u_degree)
     conserve = len(o.d_degree) > 0
-    k = -0.5 / (sigma * sigma)
+    k = -0.5 * LOG2_E / (sigma * sigma)
     inverse = 1.0 / (sigma * sigma)
     step = o.step
     for i in range(n):
@@ -398,7 +412,7 @@ def _gradient_row(o, n, t0, u0, ra, rb, rav, rbv, sigma, weight, samples, powers
             av = av * t + rav[top - 1 - m]
             bv = bv * t + rbv[top - 1 - m]
         r2 = a * a + b * b
-        e = weight * exp(k * r2)
+        e = weight * exp2(k * r2)
         d = au * bv - av * bu
         size = abs(d) if conserve else 1.0
         signed = (e if d > 0.0 else -e) if conserve else 0.0
@@ -448,7 +462,7 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
     u_row = (low - 0.5 * (o.nx - 1)) * o.step
     for q in range(o.offsets.size):
         v = v_row + o.offsets[q]
-        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], work[0], work[1], work[2], work[3], work[4], o.u_degree, ())
+        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], work[0], work[1], work[2], work[3], o.u_degree)
         for p in range(o.offsets.size):
             u = u_row + o.offsets[p]
             weight = norm * o.weights[q] * o.weights[p]

@@ -301,7 +301,7 @@ def _stamps(o, maps, fp, sigma):
             w = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step - peak[1]
             t = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step - peak[0]
             row = out[fp.start[i] : fp.start[i + 1]]
-            add_pixels(row, w, t, a, b, o.offsets, o.weights, o.step, sigma, 1.0, work, o.u_degree, o.d_degree)
+            add_pixels(row, w, t, a, b, o.offsets, o.weights, o.ramp, sigma, 1.0, work, o.u_degree, o.q_degree, o.d_degree)
     return out
 
 

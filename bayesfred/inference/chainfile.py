@@ -8,10 +8,10 @@ renames it over the old one, so that a reader finds either the old state or the 
 import hashlib
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import arviz_base
 import h5py
@@ -24,6 +24,8 @@ from bayesfred.inference.estimate import MapEstimate
 from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
+
+Read = TypeVar("Read")
 
 KIND = "bayesfred chain"
 SCHEMA = 1
@@ -50,6 +52,8 @@ class Chain:
         The maximum that the proposals are centred on.
     versions : dict of str to str
         Packages that the run was made with.
+    target_ess : float
+        Effective draws that were asked for.
     """
 
     path: Path
@@ -61,6 +65,7 @@ class Chain:
     seed: int
     estimate: MapEstimate
     versions: dict[str, str]
+    target_ess: float = 1000.0
 
     def draws(self) -> Floats:
         """All draws after burn-in, shape (n, d)."""
@@ -78,8 +83,7 @@ class Chain:
 
     def posterior(self) -> Posterior:
         """The posterior that was sampled, rebuilt from the file."""
-        with _open(self.path) as file:
-            return Posterior.read(file["posterior"])
+        return _reading(self.path, lambda file: Posterior.read(file["posterior"]))
 
 
 def open_chain(path: str | os.PathLike[str]) -> Chain:
@@ -105,15 +109,17 @@ def open_chain(path: str | os.PathLike[str]) -> Chain:
     ...
     bayesfred.errors.InputError: absent.h5: no such file, expected a chain written by `bayesfred fit`: check the path
     """
-    with _open(Path(path)) as file:
-        return _read(Path(path), file)
+    return _reading(Path(path), lambda file: _read(Path(path), file))
 
 
 def random_states(path: Path) -> list[tuple[Any, ...]]:
     """The state of every ensemble's random numbers after its last step."""
-    with _open(path) as file:
+
+    def read(file: h5py.File) -> list[tuple[Any, ...]]:
         groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
         return [tuple(group.attrs[f"random_state_{i}"] for i in range(5)) for group in groups]
+
+    return _reading(path, read)
 
 
 def fingerprint(posterior: Posterior) -> dict[str, str]:
@@ -125,8 +131,7 @@ def fingerprint(posterior: Posterior) -> dict[str, str]:
 
 def check_same_posterior(path: Path, posterior: Posterior) -> None:
     """Refuse a chain file whose frame, model, noise or priors are not those of the posterior."""
-    with _open(path) as file:
-        stored = {name: _digest(file["posterior"][name]) for name in file["posterior"]}
+    stored = _reading(path, lambda file: {name: _digest(file["posterior"][name]) for name in file["posterior"]})
     changed = [name for name, digest in fingerprint(posterior).items() if stored.get(name) != digest]
     if changed:
         raise InputError(
@@ -141,6 +146,7 @@ def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, 
     def fill(file: h5py.File) -> None:
         file.attrs.update(kind=KIND, schema=SCHEMA, seed=chain.seed, burn_in=chain.burn_in, ensembles=len(chain.chain))
         file.attrs["parameter_names"] = list(chain.parameter_names)
+        file.attrs["target_ess"] = chain.target_ess
         versions = file.create_group("versions")
         versions.attrs.update(chain.versions)
         posterior.write(file.create_group("posterior"))
@@ -195,6 +201,15 @@ def _open(path: Path) -> h5py.File:
     return file
 
 
+def _reading(path: Path, read: Callable[[h5py.File], Read]) -> Read:
+    """What `read` makes of a chain file; a file that lacks something, or whose checksums do not hold, is refused."""
+    with _open(path) as file:
+        try:
+            return read(file)
+        except (KeyError, OSError, ValueError) as error:
+            raise InputError(f"{path}: damaged ({error}), expected a whole chain file: restore a copy, or run again") from None
+
+
 def _read(path: Path, file: h5py.File) -> Chain:
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     return Chain(
@@ -207,6 +222,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
         int(file.attrs["seed"]),
         MapEstimate.read(file["estimate"]),
         {str(k): str(v) for k, v in file["versions"].attrs.items()},
+        float(file.attrs["target_ess"]),
     )
 
 

@@ -54,6 +54,8 @@ def make(name: str, family: str, parameters: Mapping[str, float]) -> Any:
     """The frozen distribution of a family, from its scipy.stats keywords."""
     if family not in SLOPES:
         raise InputError(f"prior.{name}: distribution: got {family!r}, expected one of {', '.join(SLOPES)}")
+    if not parameters.get("scale", 1.0) > 0:
+        raise InputError(f"prior.{name}: scale: got {parameters['scale']}, expected a number > 0")
     try:
         distribution = getattr(stats, family)(**parameters)
         usable = bool(np.isfinite(distribution.std())) or family == "cauchy"

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import emcee
 import filelock
@@ -153,16 +153,33 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
+class _Step(NamedTuple):
+    """All ensembles after a step."""
+
+    coords: Floats  # (ensembles, walkers, d)
+    log_prob: Floats  # (ensembles, walkers)
+    accepted: npt.NDArray[np.int64]  # (ensembles, walkers) moves accepted so far
+    random: list[tuple[Any, ...]]  # state of each ensemble's random numbers
+
+    @classmethod
+    def of(cls, states: list[emcee.State], accepted: npt.NDArray[np.int64]) -> "_Step":
+        """A copy of the ensembles' states."""
+        coords, log_prob = np.stack([s.coords for s in states]), np.stack([s.log_prob for s in states])
+        return cls(coords, log_prob, accepted, [s.random_state for s in states])
+
+    def states(self) -> list[emcee.State]:
+        """The ensembles for emcee to go on with."""
+        parts = zip(self.coords, self.log_prob, self.random, strict=True)
+        return [emcee.State(coords, log_prob=log_prob, random_state=random) for coords, log_prob, random in parts]
+
+
 class _Run:
     """A run in progress: the steps so far and the ensembles that make more."""
 
     def __init__(self, posterior: Posterior, estimate: MapEstimate, path: Path, seed: int, states: list[emcee.State]) -> None:
         self.posterior, self.estimate, self.path, self.seed = posterior, estimate, path, seed
-        self.coords: list[Floats] = []  # one (ensembles, walkers, d) a step
-        self.log_prob: list[Floats] = []
-        self.accepted = np.zeros((len(states), len(states[0].coords)), np.int64)
-        self.last = states
-        self.before: Chain | None = None
+        self.steps: list[_Step] = []
+        self.start = _Step.of(states, np.zeros((len(states), len(states[0].coords)), np.int64))
 
     @classmethod
     def begun(cls, posterior: Posterior, estimate: MapEstimate, path: Path, seed: int, ensembles: int, walkers: int) -> "_Run":
@@ -192,25 +209,25 @@ class _Run:
             for k, state in enumerate(random)
         ]
         run = cls(posterior, chain.estimate, chain.path, chain.seed, states)
-        run.coords, run.log_prob = list(chain.chain.swapaxes(0, 1)), list(chain.log_prob.swapaxes(0, 1))
-        run.accepted = chain.accepted.copy()
+        positions = zip(chain.chain.swapaxes(0, 1), chain.log_prob.swapaxes(0, 1), strict=True)
+        run.steps = [_Step(coords, log_prob, chain.accepted, random) for coords, log_prob in positions]
         return run
 
     def until(self, target_ess: float, steps: int | None, progress: bool) -> Chain:
         """Go on until the target is met, or to the given number of steps."""
         check = FIRST_CHECK
-        while steps is None and check <= len(self.coords) - 1:  # the checks fall on the same steps in a resumed run
+        while steps is None and check < len(self.steps):  # the checks fall on the same steps in a resumed run
             check = math.ceil(check * GROWTH)
         saved = time.monotonic()
         state = TextColumn("{task.fields[state]}")
         columns = (TextColumn("sampling"), BarColumn(), state, TimeElapsedColumn(), TimeRemainingColumn())
         with Progress(*columns, console=Console(stderr=True), disable=not progress) as bar:
-            task = bar.add_task("", total=steps, completed=len(self.coords), state="")
+            task = bar.add_task("", total=steps, completed=len(self.steps), state="")
             try:
-                if steps is None and self.coords and self._enough(target_ess)[0]:
-                    return self.chain()
+                if steps is None and self.steps and self._enough(target_ess)[0]:
+                    return self.chain(target_ess)
                 for _ in self._advance(MOST_STEPS if steps is None else steps):
-                    n = len(self.coords)
+                    n = len(self.steps)
                     bar.update(task, completed=n, state=f"{n} steps")
                     if steps is None and n >= check:
                         enough, share = self._enough(target_ess)
@@ -219,12 +236,12 @@ class _Run:
                         bar.update(task, total=max(n + 1, math.ceil(n / max(share, 0.05))))
                         check = math.ceil(check * GROWTH)
                     if time.monotonic() - saved > CHECKPOINT:
-                        self._save()
+                        self._save(target_ess)
                         saved = time.monotonic()
             finally:
-                if self.coords:
-                    self._save()
-        return self.chain()
+                if self.steps:
+                    self._save(target_ess)
+        return self.chain(target_ess)
 
     def _advance(self, total: int) -> Iterator[None]:
         """Step all ensembles in turn; a step counts when every ensemble has made it."""
@@ -232,36 +249,43 @@ class _Run:
             (LaplaceMove(self.estimate.params, self.estimate.covariance), 1.0 - DE_SHARE),
             (emcee.moves.DEMove(live_dangerously=True), DE_SHARE),
         ]
-        walkers, d = self.last[0].coords.shape
-        generators = [
-            emcee.EnsembleSampler(walkers, d, self.posterior.log_prob, moves=moves, vectorize=True).sample(
-                state, iterations=None, store=False, skip_initial_state_check=True
-            )
-            for state in self.last
-        ]
-        while len(self.coords) < total:
-            states = [emcee.State(next(generator), copy=True) for generator in generators]
-            self.accepted += np.stack([np.any(a.coords != b.coords, axis=1) for a, b in zip(states, self.last, strict=True)])
-            self.last = states
-            self.coords.append(np.stack([state.coords for state in states]))
-            self.log_prob.append(np.stack([state.log_prob for state in states]))
+        last = self.steps[-1] if self.steps else self.start
+        _, walkers, d = last.coords.shape
+        generators = []
+        for state in last.states():
+            sampler = emcee.EnsembleSampler(walkers, d, self.posterior.log_prob, moves=moves, vectorize=True)
+            sampler.log_prob_fn = self.posterior.log_prob  # emcee's wrapper would print a traceback when interrupted
+            generators.append(sampler.sample(state, iterations=None, store=False, skip_initial_state_check=True))
+        while len(self.steps) < total:
+            states = [next(generator) for generator in generators]
+            moved = np.stack([np.any(state.coords != before, axis=1) for state, before in zip(states, last.coords, strict=True)])
+            last = _Step.of(states, last.accepted + moved)
+            self.steps.append(last)  # all of a step or nothing, wherever an interrupt comes
             yield
 
     def _enough(self, target_ess: float) -> tuple[bool, float]:
         """Whether the draws so far suffice, and which share of the effective draws wanted they are."""
-        chain = np.stack(self.coords, axis=1)
+        chain = np.stack([step.coords for step in self.steps], axis=1)
         rhat, bulk, tail = convergence(chain[:, burn_in(chain) :])
         share = float(min(bulk.min(), tail.min()) / target_ess)
         return bool(share >= 1.0 and rhat.max() <= RHAT), share
 
-    def chain(self) -> Chain:
+    def chain(self, target_ess: float) -> Chain:
         """The run so far."""
-        chain = np.stack(self.coords, axis=1)
-        log_prob = np.stack(self.log_prob, axis=1)
-        names = self.posterior.parameter_names
+        steps = list(self.steps)
+        chain = np.stack([step.coords for step in steps], axis=1)
         return Chain(
-            self.path, names, chain, log_prob, self.accepted.copy(), burn_in(chain), self.seed, self.estimate, versions()
+            self.path,
+            self.posterior.parameter_names,
+            chain,
+            np.stack([step.log_prob for step in steps], axis=1),
+            steps[-1].accepted,
+            burn_in(chain),
+            self.seed,
+            self.estimate,
+            versions(),
+            target_ess,
         )
 
-    def _save(self) -> None:
-        write_chain(self.chain(), self.posterior, [state.random_state for state in self.last])
+    def _save(self, target_ess: float) -> None:
+        write_chain(self.chain(target_ess), self.posterior, self.steps[-1].random)
