@@ -5,8 +5,10 @@ background is constant the rest enters through its counts and number alone. The 
 calls; whoever reads it clears it.
 
 Free fluxes. Given everything else the expected counts mu = B + sum_s F_s K_s are linear in the fluxes F, and with the
-prior F_s ~ Gamma(2, scale c_s/2) the log-posterior in F is concave and self-concordant. Newton's iteration, damped by
-1/(1 + decrement) until it converges quadratically, finds its maximum from any start. With H minus its Hessian there,
+prior F_s ~ Gamma(2, scale c_s/2) the log-posterior in F is concave: a sum of n log(mu), log(F) and linear terms. Along a
+Newton step let d be the largest relative change of any of these mu and F. A fraction t < 1/d of the step raises the second
+derivative by no more than 1/(1 - t d)^2, so the gain is largest, for certain, at t = 1/(1 + d): mu and F stay positive,
+the iteration climbs from any start, and converges quadratically as d vanishes. With H minus the Hessian at the maximum,
 
     log L(theta) = max_F [log L(theta, F) + log p(F)] + n_s/2 log(2 pi) - 1/2 log det H          (Laplace)
 
@@ -457,6 +459,30 @@ def _weigh_footprint(counts, w, fp, s, background, score, weight):
 
 
 @nb.njit(cache=True)
+def _blank(fp, s, pitch, out):
+    """Zero an image on one source's footprint."""
+    for i in range(fp.first[s], fp.first[s + 1]):
+        at = fp.row[i] * pitch + fp.low[i]
+        out[at : at + fp.size[i]] = 0.0
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _largest_change(counts, w, fp, s, background, change):
+    """Largest |change| / mu among one source's pixels that hold counts."""
+    ny = w.span.shape[0]
+    pitch = w.image.size // ny
+    largest = 0.0
+    for i in range(fp.first[s], fp.first[s + 1]):
+        c0, c1, c2 = _background_row(background, fp.row[i], ny)
+        for k in range(fp.size[i]):
+            at = fp.row[i] * pitch + fp.low[i] + k
+            if counts.values[at] > 0.0:
+                u = (2 * (fp.low[i] + k) - counts.nx + 1) / counts.nx
+                largest = max(largest, abs(change[at]) / (w.image[at] + c0 + u * (c1 + u * c2)))
+    return largest
+
+
+@nb.njit(cache=True)
 def _first_flux(counts, w, fp, s, stamps, background):
     """Least-squares flux of one source, its neighbours ignored."""
     ny = w.span.shape[0]
@@ -511,16 +537,22 @@ def _profile(counts, w, fp, boxes, clusters, stamps, background, scale, flux, fa
             if not _cholesky(h):
                 break
             _solve(h, step)
-            decrement = math.sqrt(max(np.dot(gradient, step), 0.0))
-            if decrement <= 1e-9:
+            if np.dot(gradient, step) <= 1e-18:  # the square of the distance in standard deviations
                 converged = True
                 break
-            length = 1.0 if decrement < 0.25 else 1.0 / (1.0 + decrement)
+            largest = 0.0
+            for i in range(n):
+                largest = max(largest, abs(step[i]) / flux[members[i]])
+                _blank(fp, members[i], pitch, score)
+            for i in range(n):
+                _draw(fp, members[i], stamps, step[i], pitch, score)
+            for i in range(n):
+                largest = max(largest, _largest_change(counts, w, fp, members[i], background, score))
+            length = 1.0 / (1.0 + largest)
             for i in range(n):
                 s = members[i]
-                after = max(flux[s] + length * step[i], 0.01 * flux[s])
-                _draw(fp, s, stamps, after - flux[s], pitch, w.image)
-                flux[s] = after
+                flux[s] += length * step[i]
+                _draw(fp, s, stamps, length * step[i], pitch, w.image)
         if not converged:
             return -math.inf
         for i in range(n):

@@ -314,12 +314,12 @@ class Posterior:
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
         vector = self._vectors(params)[0]
+        if not np.isfinite(self.log_prob(vector)):
+            return np.full(vector.size, np.nan)
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
-        ok = self._use(lambda w: _kernels.gradient(
+        self._use(lambda w: _kernels.gradient(
             self._optics, self._frame, w, *arguments, self._flux, self._free, self._basis, sources, background))  # fmt: skip
-        if not ok:
-            return np.full(vector.size, np.nan)
         if isinstance(self.noise, BackgroundNoise):
             level = arguments[2][0]
             residual = self.counts - self.expected_counts(vector)
@@ -339,14 +339,14 @@ class Posterior:
         ndarray, shape (d, d); NaN outside the prior's support
         """
         vector = self._vectors(params)[0]
+        if not np.isfinite(self.log_prob(vector)):
+            return np.full((vector.size, vector.size), np.nan)
         arguments = [a[0] for a in self._arguments(vector[None])]
         terms = len(self.nuisances.background_names)
         size = self._basis.row.size + terms
         out = np.zeros((size, size))
-        ok = self._use(lambda w: _kernels.fisher(
+        self._use(lambda w: _kernels.fisher(
             self._optics, self._frame, w, *arguments, terms, self._flux, self._free, self._basis, out))  # fmt: skip
-        if not ok:
-            return np.full(out.shape, np.nan)
         if isinstance(self.noise, BackgroundNoise):
             k = self._basis.row.size
             out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2

@@ -4,6 +4,7 @@ The optimiser needs the slope and the curvature of every log-density, in closed 
 for which they are known. Default priors are weak: see `default_prior`.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -54,14 +55,17 @@ def make(name: str, family: str, parameters: Mapping[str, float]) -> Any:
     """The frozen distribution of a family, from its scipy.stats keywords."""
     if family not in SLOPES:
         raise InputError(f"prior.{name}: distribution: got {family!r}, expected one of {', '.join(SLOPES)}")
-    if not parameters.get("scale", 1.0) > 0:
+    for key, value in parameters.items():
+        if not (isinstance(value, int | float) and math.isfinite(value)):
+            raise InputError(f"prior.{name}: {key}: got {value!r}, expected a finite number")
+    if parameters.get("scale", 1.0) <= 0:
         raise InputError(f"prior.{name}: scale: got {parameters['scale']}, expected a number > 0")
     try:
         distribution = getattr(stats, family)(**parameters)
-        usable = bool(np.isfinite(distribution.std())) or family == "cauchy"
+        shapes = _standard(distribution)[0]
     except TypeError as error:
         raise InputError(f"prior.{name}: got {dict(parameters)} for {family}: {error}; see scipy.stats.{family}") from None
-    if not usable and not distribution.dist._argcheck(*_standard(distribution)[0]):
+    if not np.all(distribution.dist._argcheck(*shapes)):
         raise InputError(f"prior.{name}: got {dict(parameters)}, expected valid parameters of scipy.stats.{family}")
     return distribution
 
