@@ -66,6 +66,16 @@ class Maps(NamedTuple):
     rows: Ints  # (s, 2) first row and the one after the last
 
 
+class Footprints(NamedTuple):
+    """The pixels of every source, as rows: of source s those from first[s] to first[s + 1]."""
+
+    first: Ints  # (s + 1,)
+    low: Ints  # (rows,) first pixel
+    size: Ints  # pixels
+    start: Ints  # (rows + 1,) where the row's samples begin, counted over all sources
+    row: Ints  # the frame's row
+
+
 def stride(nx: int) -> int:
     """Pixels a padded image row takes."""
     return -(-(nx + LANES) // SEGMENT) * SEGMENT
@@ -335,20 +345,42 @@ def add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, amplitude, work, 
 
 
 @nb.njit(cache=True)
-def add_source(o, maps, s, sigma, flux, out, work):
+def footprints(o, maps):
+    """The rows of pixels that every source reaches."""
+    size = 0
+    for s in range(o.x.size):
+        size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
+    first = np.zeros(o.x.size + 1, np.int64)
+    low, count, row = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    start = np.zeros(size + 1, np.int64)
+    ny, nx, step = o.ny, o.nx, o.step
+    i = 0
+    for s in range(o.x.size):
+        peak, ellipse = maps.peak[s], maps.ellipse[s]
+        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
+            at, n = chord(peak, ellipse, j, ny, nx, step)
+            if n > 0:
+                low[i], count[i], row[i] = at, n, j
+                start[i + 1] = start[i] + n
+                i += 1
+        first[s + 1] = i
+    return Footprints(first, low[:i], count[:i], start[: i + 1], row[:i])
+
+
+@nb.njit(cache=True)
+def add_source(o, maps, fp, s, sigma, flux, out, work):
     """Add source s to the padded, flattened image `out`."""
     # What the rows share is taken out of the tuples once: handing them on costs more than a short row.
-    a, b, peak, ellipse = maps.a[s], maps.b[s], maps.peak[s], maps.ellipse[s]
+    a, b, u, v = maps.a[s], maps.b[s], maps.peak[s, 0], maps.peak[s, 1]
     offsets, weights, step, ny, nx, ramp = o.offsets, o.weights, o.step, o.ny, o.nx, o.ramp
     pitch = out.size // ny
-    for j in range(maps.rows[s, 0], maps.rows[s, 1]):
-        low, n = chord(peak, ellipse, j, ny, nx, step)
-        if n > 0:
-            start = j * pitch + low
-            w = (j - 0.5 * (ny - 1)) * step - peak[1]
-            t = (low - 0.5 * (nx - 1)) * step - peak[0]
-            row = out[start : start + n]
-            add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, flux, work, o.u_degree, o.q_degree, o.d_degree)
+    for i in range(fp.first[s], fp.first[s + 1]):
+        low, j = fp.low[i], fp.row[i]
+        start = j * pitch + low
+        w = (j - 0.5 * (ny - 1)) * step - v
+        t = (low - 0.5 * (nx - 1)) * step - u
+        row = out[start : start + fp.size[i]]
+        add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, flux, work, o.u_degree, o.q_degree, o.d_degree)
 
 
 @nb.njit(cache=True)
@@ -362,7 +394,7 @@ def new_maps(o):
 @nb.njit(cache=True)
 def new_work(o):
     """Room for a row's polynomials."""
-    return np.empty((6, 2 * len(o.u_degree) + 2))
+    return np.empty((7, 2 * len(o.u_degree) + 2))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -371,8 +403,9 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
     maps = new_maps(o)
     work = new_work(o)
     unfolded = locate(o, theta, offset_x, offset_y, sigma, maps)
+    fp = footprints(o, maps)
     for s in range(o.x.size):
-        add_source(o, maps, s, sigma, flux[s], out, work)
+        add_source(o, maps, fp, s, sigma, flux[s], out, work)
     return unfolded
 
 
@@ -389,104 +422,144 @@ class Basis(NamedTuple):
     lever: Floats  # (s, parameters)
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _gradient_row(o, n, t0, u0, ra, rb, rav, rbv, sigma, weight, samples, powers, row_k, row_s):
-    """Samples of the kernel's first derivatives on one row of nodes, and the powers of u there.
-
-    With E = weight p and s = sign(D): samples = p_a |D|, p_b |D|, s E b_v, s E b_u, s E a_u, s E a_v.
-    """
-    top = len(o.u_degree)
-    conserve = len(o.d_degree) > 0
-    k = -0.5 * LOG2_E / (sigma * sigma)
-    inverse = 1.0 / (sigma * sigma)
-    step = o.step
-    for i in range(n):
-        t = t0 + step * i
-        a, b, av, bv = ra[top], rb[top], rav[top], rbv[top]
-        au, bu = 0.0, 0.0
+@nb.njit(inline="always")
+def _exponential_row(out, ramp, t0, rq, weight, q_degree):
+    """out[i] = weight 2^q(t) at t = t0 + ramp[i]."""
+    top = len(q_degree)
+    for i in range(out.size):
+        t = t0 + ramp[i]
+        q = rq[top]
         for m in range(top):
-            au = au * t + a
-            bu = bu * t + b
-            a = a * t + ra[top - 1 - m]
-            b = b * t + rb[top - 1 - m]
-            av = av * t + rav[top - 1 - m]
-            bv = bv * t + rbv[top - 1 - m]
-        r2 = a * a + b * b
-        e = weight * exp2(k * r2)
-        d = au * bv - av * bu
-        size = abs(d) if conserve else 1.0
-        signed = (e if d > 0.0 else -e) if conserve else 0.0
-        samples[0, i] = -a * inverse * e * size
-        samples[1, i] = -b * inverse * e * size
-        samples[2, i] = signed * bv
-        samples[3, i] = signed * bu
-        samples[4, i] = signed * au
-        samples[5, i] = signed * av
-        row_k[i] += e * size
-        row_s[i] += e * size * (r2 * inverse - 2.0) / sigma
-        powers[0, i] = 1.0
-        u = u0 + step * i
+            q = q * t + rq[top - 1 - m]
+        out[i] = weight * exp2(q)
+
+
+@nb.njit(inline="always")
+def _times_polynomial(out, source, factor, ramp, t0, coefficients, degree):
+    """out[i] = factor times source[i] times a polynomial at t = t0 + ramp[i]."""
+    top = len(degree)
+    for i in range(out.size):
+        t = t0 + ramp[i]
+        p = coefficients[top]
         for m in range(top):
-            powers[m + 1, i] = powers[m, i] * u
+            p = p * t + coefficients[top - 1 - m]
+        out[i] = p * factor * source[i]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _add_monomials(basis_powers, v, n, along, first, second, powers, out):
-    """Rows of the basis: B p_a |D| + s E (B_u first - B_v second) for the monomials B = u^m v^n of f (or of g)."""
+@nb.njit(inline="always")
+def _absolute_and_sign(absolute, signed, source):
+    """absolute = |source * signed|, signed = |source| times the sign of their product."""
+    for i in range(source.size):
+        d = signed[i]
+        e = source[i]
+        absolute[i] = abs(d)
+        signed[i] = e if d > 0.0 else -e
+
+
+@nb.njit(inline="always")
+def _add_row_of(out, row):
+    for i in range(row.size):
+        out[i] += row[i]
+
+
+@nb.njit(inline="always")
+def _powers_row(powers, ramp, u0, n):
+    """powers[m] = u^m at u = u0 + ramp[i]."""
+    powers[0, :n] = 1.0
+    for m in range(1, powers.shape[0]):
+        before, row = powers[m - 1], powers[m]
+        for i in range(n):
+            row[i] = before[i] * (u0 + ramp[i])
+
+
+@nb.njit(inline="always")
+def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start):
+    """Rows of the basis from `start` on: B along + B_u first + B_v second for the monomials B = u^m v^q of f (or of g)."""
     for k in range(basis_powers.shape[0]):
         m = basis_powers[k, 0]
         q = basis_powers[k, 1]
         vq = v**q
-        row = out[k]
         by = q * v ** (q - 1) if q > 0 else 0.0
+        row, power = out[start + k], powers[m]
         for i in range(n):
-            row[i] += powers[m, i] * (vq * along[i] - by * second[i])
+            row[i] += power[i] * (vq * along[i] + by * second[i])
         if m > 0:
             bx = m * vq
+            lower = powers[m - 1]
             for i in range(n):
-                row[i] += bx * powers[m - 1, i] * first[i]
+                row[i] += bx * lower[i] * first[i]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
 def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
-    An f-term B changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term changes
-    b, hence p by p_b B and D by B_v a_u - B_u a_v.
+    An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term changes
+    b, hence p by p_b B and D by B_v a_u - B_u a_v. With E = weight p and s = sign(D) the rows of `samples` are E, E |D|, s E,
+    p_a |D|, p_b |D|, s E b_v, -s E b_u, -s E a_v, s E a_u.
     """
-    n_f = basis.f.shape[0]
-    n_g = basis.g.shape[0]
-    out[:, :n] = 0.0
-    norm = 1.0 / (2.0 * math.pi * sigma * sigma)
+    ra, rb, rav, rbv, rq, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    ramp, conserve = o.ramp, len(o.d_degree) > 0
+    n_f, n_g = basis.f.shape[0], basis.g.shape[0]
+    for k in range(out.shape[0]):
+        out[k, :n] = 0.0
+    k = -0.5 * LOG2_E / (sigma * sigma)
+    inverse = 1.0 / (sigma * sigma)
+    norm = inverse / (2.0 * math.pi)
     v_row = (j - 0.5 * (o.ny - 1)) * o.step
     u_row = (low - 0.5 * (o.nx - 1)) * o.step
+    e, size, signed, along_a, along_b = samples[0, :n], samples[1, :n], samples[2, :n], samples[3, :n], samples[4, :n]
+    f_u, f_v, g_u, g_v = samples[5, :n], samples[6, :n], samples[7, :n], samples[8, :n]
+    row_k, row_s = out[n_f + n_g], out[n_f + n_g + 1]
+    top = len(o.u_degree)
+    slope[:] = 0.0
     for q in range(o.offsets.size):
         v = v_row + o.offsets[q]
-        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], work[0], work[1], work[2], work[3], o.u_degree)
+        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.u_degree)
+        _row_products(ra, rb, rav, rbv, k, 1.0, rq, rd, o.u_degree, o.q_degree, o.d_degree)
         for p in range(o.offsets.size):
             u = u_row + o.offsets[p]
-            weight = norm * o.weights[q] * o.weights[p]
-            _gradient_row(
-                o, n, u - maps.peak[s, 0], u, work[0], work[1], work[2], work[3], sigma, weight,
-                samples, powers, out[n_f + n_g], out[n_f + n_g + 1],
-            )  # fmt: skip
-            _add_monomials(basis.f, v, n, samples[0], samples[2], samples[3], powers, out[:n_f])
-            samples[4:6] *= -1.0
-            _add_monomials(basis.g, v, n, samples[1], samples[5], samples[4], powers, out[n_f : n_f + n_g])
+            t = u - maps.peak[s, 0]
+            _exponential_row(e, ramp, t, rq, norm * o.weights[q] * o.weights[p], o.q_degree)
+            _times_polynomial(signed, e, 1.0, ramp, t, rd, o.d_degree)
+            _absolute_and_sign(size, signed, e)
+            _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.u_degree)
+            _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.u_degree)
+            if conserve:
+                _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.u_degree)
+                _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.u_degree)
+                for m in range(top):
+                    slope[m] = -(m + 1) * rb[m + 1]
+                _times_polynomial(f_v, signed, 1.0, ramp, t, slope, o.u_degree)
+                for m in range(top):
+                    slope[m] = (m + 1) * ra[m + 1]
+                _times_polynomial(g_v, signed, 1.0, ramp, t, slope, o.u_degree)
+            else:
+                samples[5:] = 0.0
+            _add_row_of(row_k, size)
+            rq[0] += LOG2_E  # dK/dsigma = K ((a^2 + b^2) / sigma^2 - 2) / sigma, and a^2 + b^2 = q / k
+            _times_polynomial(e, size, -2.0 / (LOG2_E * sigma), ramp, t, rq, o.q_degree)
+            rq[0] -= LOG2_E
+            _add_row_of(row_s, e)
+            _powers_row(powers, ramp, u, n)
+            _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
+            _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
 
 
 @nb.njit(cache=True, fastmath=FAST)
-def add_jacobian_rows(o, maps, basis, flux, sigma, first, last, out):
+def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
     work = new_work(o)
     width = out.shape[2]
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
-    samples = np.empty((6, width))
+    samples = np.empty((9, width))
     powers = np.empty((len(o.u_degree) + 1, width))
     for s in range(o.x.size):
-        for j in range(max(first, maps.rows[s, 0]), min(last, maps.rows[s, 1])):
-            low, n = chord(maps.peak[s], maps.ellipse[s], j, o.ny, o.nx, o.step)
-            if n == 0:
+        if maps.rows[s, 0] >= last or maps.rows[s, 1] <= first:
+            continue
+        for p in range(fp.first[s], fp.first[s + 1]):
+            j, low, n = fp.row[p], fp.low[p], fp.size[p]
+            if not first <= j < last:
                 continue
             basis_row(o, maps, basis, s, j, low, n, sigma, rows, samples, powers, work)
             for k in range(basis.row.size):
@@ -503,4 +576,4 @@ def jacobian(o, theta, sigma, flux, basis, out):
     """d image / d parameters into out (parameters, ny, padded row)."""
     maps = new_maps(o)
     locate(o, theta, 0.0, 0.0, sigma, maps)
-    add_jacobian_rows(o, maps, basis, flux, sigma, 0, o.ny, out)
+    add_jacobian_rows(o, maps, footprints(o, maps), basis, flux, sigma, 0, o.ny, out)

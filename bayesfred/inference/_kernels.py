@@ -42,7 +42,7 @@ from bayesfred.imaging._kernels import (
     as_bits,
     as_float,
     basis_row,
-    chord,
+    footprints,
     locate,
     new_maps,
     new_work,
@@ -83,16 +83,6 @@ class Workspace(NamedTuple):
     span: Ints  # (ny, 2) first and last marked segment of a row
     score: Floats  # (ny * stride,) scratch
     weight: Floats
-
-
-class Footprints(NamedTuple):
-    """The pixels of every source, as rows: of source s those from first[s] to first[s + 1]."""
-
-    first: Ints  # (s + 1,)
-    low: Ints  # (rows,) first pixel
-    size: Ints  # pixels
-    start: Ints  # (rows + 1,) where the row's samples begin
-    row: Ints  # the frame's row
 
 
 class Clusters(NamedTuple):
@@ -141,18 +131,16 @@ def _mark(flags, span, per_row, j, low, n):
     b = (low + n - 1) // SEGMENT
     span[j, 0] = min(span[j, 0], a)
     span[j, 1] = max(span[j, 1], b)
-    flags[j * per_row + a : j * per_row + b + 1] = 1
+    for k in range(j * per_row + a, j * per_row + b + 1):
+        flags[k] = 1
 
 
 @nb.njit(cache=True)
-def _mark_sources(o, maps, w):
-    per_row = w.flags.size // o.ny
-    for s in range(o.x.size):
-        peak, ellipse = maps.peak[s], maps.ellipse[s]
-        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
-            low, n = chord(peak, ellipse, j, o.ny, o.nx, o.step)
-            if n > 0:
-                _mark(w.flags, w.span, per_row, j, low, n)
+def _mark_sources(fp, w):
+    flags, span = w.flags, w.span
+    per_row = flags.size // span.shape[0]
+    for i in range(fp.row.size):
+        _mark(flags, span, per_row, fp.row[i], fp.low[i], fp.size[i])
 
 
 @nb.njit(cache=True)
@@ -203,17 +191,17 @@ def _background_row(background, j, ny):
 
 @nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
 def _poisson_run(image, values, u, step, c0, c1, c2):
-    """Sum of n log(mu) - mu, and the smallest mu, over the unmasked pixels of a stretch."""
+    """Sum of n log(mu) - mu over the unmasked pixels of a stretch, and how many of these have no positive mu."""
     total = 0.0
-    lowest = 1.0
+    impossible = 0.0  # counted, not min(mu): a minimum would keep the loop from vectorising
     for i in range(image.size):
         x = u + step * i
         mu = image[i] + (c0 + x * (c1 + x * c2))
         n = values[i]
         term = n * log(max(mu, 1e-300)) - mu
         total += term if n > LIMIT else 0.0
-        lowest = min(lowest, mu if n > LIMIT else 1.0)
-    return total, lowest
+        impossible += 1.0 if (n > LIMIT and mu <= 0.0) else 0.0
+    return total, impossible
 
 
 @nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
@@ -232,7 +220,7 @@ def _log_likelihood(counts, w, background):
     ny = w.span.shape[0]
     per_row = w.flags.size // ny
     step = 2.0 / counts.nx
-    total, lowest = 0.0, 1.0
+    total, impossible = 0.0, 0.0
     pixels, rest, squares = counts.pixels, counts.total, counts.squares
     for j in range(ny):
         c0, c1, c2 = _background_row(background, j, ny)
@@ -242,8 +230,8 @@ def _log_likelihood(counts, w, background):
             b = (j * per_row + stop) * SEGMENT
             if counts.kind == POISSON:
                 u = (2 * start * SEGMENT - counts.nx + 1) / counts.nx
-                part, low = _poisson_run(w.image[a:b], counts.values[a:b], u, step, c0, c1, c2)
-                lowest = min(lowest, low)
+                part, bad = _poisson_run(w.image[a:b], counts.values[a:b], u, step, c0, c1, c2)
+                impossible += bad
             else:
                 part = _square_run(w.image[a:b], counts.values[a:b], c0)
             total += part
@@ -253,9 +241,7 @@ def _log_likelihood(counts, w, background):
                 squares -= counts.segment_squares[k]
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)
     level = background[0]
-    if pixels > 0.0:
-        lowest = min(lowest, level)
-    if lowest <= 0.0 or (counts.kind == GAUSSIAN and level <= 0.0):
+    if impossible > 0.0 or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
         return -math.inf
     if counts.kind == GAUSSIAN:
         total += squares - 2.0 * level * rest + level * level * pixels
@@ -263,33 +249,6 @@ def _log_likelihood(counts, w, background):
     if pixels > 0.0:
         total += rest * math.log(level) - pixels * level
     return total
-
-
-@nb.njit(cache=True)
-def _footprints(o, maps):
-    """The rows of pixels that every source reaches."""
-    size = 0
-    for s in range(o.x.size):
-        size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
-    first = np.zeros(o.x.size + 1, np.int64)
-    low, count, row = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
-    start = np.zeros(size + 1, np.int64)
-    i = 0
-    for s in range(o.x.size):
-        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
-            at, n = chord(maps.peak[s], maps.ellipse[s], j, o.ny, o.nx, o.step)
-            if n > 0:
-                low[i], count[i], row[i] = at, n, j
-                start[i + 1] = start[i] + n
-                i += 1
-        first[s + 1] = i
-    return Footprints(first, low[:i], count[:i], start[: i + 1], row[:i])
-
-
-@nb.njit(cache=True)
-def _no_footprints():
-    none = np.empty(0, np.int64)
-    return Footprints(np.zeros(1, np.int64), none, none, np.zeros(1, np.int64), none)
 
 
 @nb.njit(cache=True)
@@ -569,14 +528,14 @@ def _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted)
     Returns what the profiling adds to the log-likelihood, and what it knows of the sources: their footprints, boxes,
     clusters, stamps and Cholesky factors (empty where fluxes are fixed).
     """
-    _mark_sources(o, maps, w)
+    fp = footprints(o, maps)
+    _mark_sources(fp, w)
     if counts.varies:
         _mark_counted(counts, w)
     sigma = nuisances[3]
     extra = 0.0
-    fp = _footprints(o, maps) if free else _no_footprints()
     boxes = _boxes(fp)
-    clusters = _clusters(boxes)
+    clusters = _clusters(boxes[: boxes.shape[0] if free else 0])
     stamps = _stamps(o, maps, fp, sigma) if free else np.empty(0)
     factors = np.empty(clusters.start[-1])
     if free:
@@ -585,7 +544,7 @@ def _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted)
         work = new_work(o)
         for s in range(o.x.size):
             fitted[s] = nuisances[0] * flux[s]
-            add_source(o, maps, s, sigma, fitted[s], w.image, work)
+            add_source(o, maps, fp, s, sigma, fitted[s], w.image, work)
     return extra, fp, boxes, clusters, stamps, factors
 
 
@@ -719,20 +678,18 @@ def gradient(o, counts, w, theta, nuisances, background, flux, free, basis, out,
     pitch = w.image.size // o.ny
     work = new_work(o)
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, pitch))
-    samples, powers = np.empty((6, pitch)), np.empty((len(o.u_degree) + 1, pitch))
+    samples, powers = np.empty((9, pitch)), np.empty((len(o.u_degree) + 1, pitch))
     ones, c = np.ones(pitch), np.empty(pitch)
     moments = np.empty(rows.shape[0])
     for s in range(o.x.size):
         moments[:] = 0.0
-        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
-            low, n = chord(maps.peak[s], maps.ellipse[s], j, o.ny, o.nx, o.step)
-            if n == 0:
-                continue
+        for p in range(fp.first[s], fp.first[s + 1]):
+            j, low, n = fp.row[p], fp.low[p], fp.size[p]
             at = j * pitch + low
             for k in range(n):
                 c[k] = fitted[s] * image[at + k]
             if free:
-                q = fp.start[fp.first[s] + j - boxes[s, 0]]
+                q = fp.start[p]
                 for k in range(n):
                     c[k] += z[s] * w.score[at + k] - w.weight[at + k] * mixed[q + k]
             basis_row(o, maps, basis, s, j, low, n, nuisances[3], rows, samples, powers, work)
@@ -822,7 +779,7 @@ def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis,
     for top in range(0, ny, BAND):
         last = min(top + BAND, ny)
         band[:] = 0.0
-        add_jacobian_rows(o, maps, basis, fitted, nuisances[3], top, last, band)
+        add_jacobian_rows(o, maps, fp, basis, fitted, nuisances[3], top, last, band)
         for j in range(top, last):
             row = band[:, j - top]
             v = (2 * j - ny + 1) / ny
