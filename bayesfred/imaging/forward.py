@@ -106,7 +106,7 @@ class ForwardModel:
             nx=nx,
             cut=-2.0 * math.log(self.tolerance) if self.tolerance > 0 else math.inf,
             v_degree=max(1, int(np.concatenate([f, g])[:, 3].max())),
-            ramp=float(self.detector.binning) * np.arange(_kernels.stride(nx)),
+            ramp=self.detector.binning * np.arange(_kernels.stride(nx), dtype=np.float64),
             u_degree=(0,) * u_degree,
             q_degree=(0,) * (2 * u_degree),
             d_degree=(0,) * (2 * u_degree - 1) if self.conserve_flux else (),

@@ -781,22 +781,23 @@ def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis,
         band[:] = 0.0
         add_jacobian_rows(o, maps, fp, basis, fitted, nuisances[3], top, last, band)
         for j in range(top, last):
-            row = band[:, j - top]
             v = (2 * j - ny + 1) / ny
             for i in range(pitch):
                 u = (2 * i - o.nx + 1) / o.nx
-                row[sources, i] = 1.0
+                band[sources, j - top, i] = 1.0
                 if terms > 1:
-                    row[sources + 1, i], row[sources + 2, i] = u, v
+                    band[sources + 1, j - top, i], band[sources + 2, j - top, i] = u, v
                 if terms > 3:
-                    row[sources + 3, i], row[sources + 4, i], row[sources + 5, i] = u * u, u * v, v * v
+                    band[sources + 3, j - top, i], band[sources + 4, j - top, i] = u * u, u * v
+                    band[sources + 5, j - top, i] = v * v
             start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
             while start >= 0:
                 a, b = start * SEGMENT, stop * SEGMENT
                 weight = w.weight[j * pitch + a : j * pitch + b]
                 for k in range(size):
+                    left = band[k, j - top, a:b]
                     for m in range(k + 1):
-                        out[k, m] += _dot(row[k, a:b], row[m, a:b], weight)
+                        out[k, m] += _dot(left, band[m, j - top, a:b], weight)
                 start, stop = _next_run(w.flags, w.span, per_row, j, stop)
         if free:
             for s in range(flux.size):
