@@ -69,7 +69,6 @@ class Counts(NamedTuple):
     segment_squares: Floats
     pixels: float
     total: float
-    squares: float
     nx: int
     kind: int
     varies: bool  # whether the background is a polynomial of order > 0
@@ -221,7 +220,7 @@ def _log_likelihood(counts, w, background):
     per_row = w.flags.size // ny
     step = 2.0 / counts.nx
     total, impossible = 0.0, 0.0
-    pixels, rest, squares = counts.pixels, counts.total, counts.squares
+    pixels, rest = counts.pixels, counts.total
     for j in range(ny):
         c0, c1, c2 = _background_row(background, j, ny)
         start, stop = _next_run(w.flags, w.span, per_row, j, w.span[j, 0])
@@ -238,9 +237,15 @@ def _log_likelihood(counts, w, background):
             for k in range(j * per_row + start, j * per_row + stop):
                 pixels -= counts.segment_pixels[k]
                 rest -= counts.segment_sum[k]
-                squares -= counts.segment_squares[k]
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)
     level = background[0]
+    if counts.kind == GAUSSIAN:  # afresh: what is left of the totals would have lost its digits to bright sources
+        pixels, rest, squares = 0.0, 0.0, 0.0
+        for k in range(w.flags.size):
+            if w.flags[k] == 0:
+                pixels += counts.segment_pixels[k]
+                rest += counts.segment_sum[k]
+                squares += counts.segment_squares[k]
     if impossible > 0.0 or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
         return -math.inf
     if counts.kind == GAUSSIAN:
@@ -459,7 +464,7 @@ def _first_flux(counts, w, fp, s, stamps, background):
     return above / below if below > 0.0 else 0.0
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, error_model="numpy")
 def _profile(counts, w, fp, boxes, clusters, stamps, background, scale, flux, factors):
     """Fill `flux` with its maximum and `factors` with the Cholesky factors of H; add the sources to the image.
 

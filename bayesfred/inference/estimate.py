@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy import linalg, optimize
 
 from bayesfred.errors import InputError
+from bayesfred.inference import priors
 from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
@@ -73,15 +74,16 @@ class MapEstimate:
 
 
 def undetermined(posterior: Posterior, params: Floats) -> tuple[str, ...]:
-    """Parameters that the frame says next to nothing about.
+    """Parameters about which neither the frame nor a prior that was given says anything.
 
-    With S the prior's standard deviations, the eigenvalues of S I S, I the Fisher information, compare what the frame
-    knows with what the prior knows, direction by direction. The names are those that make up the directions whose
-    eigenvalue is below `LEAST_INFORMATION`.
+    With S the default priors' standard deviations, the eigenvalues of S I S compare, direction by direction, what is known
+    with what the default priors know; I is the Fisher information plus what the given priors know more than the default ones.
+    The names are those that make up the directions whose eigenvalue is below `LEAST_INFORMATION`.
     """
-    sd = np.array([p.std() for p in posterior.prior.values()])
-    sd = np.where(np.isfinite(sd), sd, np.abs([p.interval(0.68) for p in posterior.prior.values()]).max(axis=1))
-    values, vectors = np.linalg.eigh(posterior.fisher(params) * np.outer(sd, sd))
+    sd = np.array([posterior.default_prior(name).std() for name in posterior.parameter_names])
+    given = np.array([priors.slope(p, x)[1] for p, x in zip(posterior.prior.values(), params, strict=True)])
+    information = posterior.fisher(params) + np.diag(np.maximum(given - sd**-2.0, 0.0))
+    values, vectors = np.linalg.eigh(information * np.outer(sd, sd))
     weak = (vectors[:, values < LEAST_INFORMATION] ** 2).sum(axis=1) > 0.1
     return tuple(name for name, is_weak in zip(posterior.parameter_names, weak, strict=True) if is_weak)
 

@@ -250,12 +250,13 @@ class Posterior:
             raise InputError(f"prior: got {', '.join(unknown)}, expected names among {', '.join(self.parameter_names)}")
         for name, distribution in given.items():
             priors.check(name, distribution)
+        return {name: given.get(name) or self.default_prior(name) for name in self.parameter_names}
+
+    def default_prior(self, name: str) -> Any:
+        """The prior that a parameter has unless another is given."""
         m = self.model
         level = max(float(np.mean(self.counts[self.mask])), 1.0 / self.mask.sum())
-        for name in self.parameter_names:
-            if name not in given:
-                given[name] = priors.default_prior(name, m.distortion, m.detector, level, m.psf.sigma)
-        return {name: given[name] for name in self.parameter_names}
+        return priors.default_prior(name, m.distortion, m.detector, level, m.psf.sigma)
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
@@ -383,7 +384,7 @@ class Posterior:
         ok = self._use(lambda w: _kernels.expected(
             self._optics, self._frame, w, *arguments, self._flux, self._free, fluxes, out))  # fmt: skip
         if not ok:
-            out[:] = np.nan
+            out[:] = fluxes[:] = np.nan
         return out[:, :nx] - self.noise.shift, fluxes
 
     def start(self) -> Floats:
@@ -464,7 +465,7 @@ class Posterior:
         total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
         return _kernels.Counts(
             values.ravel(), used.sum(axis=1).astype(float), total, squares,
-            float(used.sum()), float(total.sum()), float(squares.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
+            float(used.sum()), float(total.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
         )  # fmt: skip
 
     @cached_property

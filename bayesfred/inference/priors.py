@@ -49,6 +49,8 @@ def check(name: str, distribution: Any) -> None:
             f"prior: {name}: got {family or type(distribution).__name__}, expected a frozen scipy.stats distribution "
             f"among {', '.join(SLOPES)}"
         )
+    if not _standard(distribution)[2] > 0:
+        raise InputError(f"prior: {name}: scale: got {_standard(distribution)[2]}, expected a number > 0")
 
 
 def make(name: str, family: str, parameters: Mapping[str, float]) -> Any:

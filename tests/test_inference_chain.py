@@ -1,0 +1,382 @@
+"""Runs and their files: resuming, interrupts, damage, and what others can read of them."""
+
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import emcee
+import filelock
+import h5py
+import numba as nb
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+from test_inference import EVERYTHING, make_model, make_posterior, make_truth
+
+from bayesfred.errors import InputError
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.scene import SourceCatalog
+from bayesfred.inference.chainfile import Chain, fingerprint, open_chain
+from bayesfred.inference.estimate import MapEstimate, find_map
+from bayesfred.inference.noise import BackgroundNoise, PoissonNoise
+from bayesfred.inference.posterior import Nuisances, Posterior
+from bayesfred.inference.sampling import sample
+
+Floats = NDArray[np.float64]
+
+TOTAL = 12
+
+
+@pytest.fixture(scope="module")
+def posterior() -> Posterior:
+    rng = np.random.default_rng(50)
+    model = make_model(tolerance=1e-8)
+    return make_posterior(model, make_truth(model, rng), rng)[0]
+
+
+@pytest.fixture(scope="module")
+def estimate(posterior: Posterior) -> MapEstimate:
+    return find_map(posterior)
+
+
+def run(posterior: Posterior, estimate: MapEstimate | None, path: Path, steps: int | None = TOTAL, **options: Any) -> Chain:
+    settings: dict[str, Any] = {"seed": 1, "ensembles": 2, "walkers": 8, "progress": False, **options}
+    return sample(posterior, estimate, path=path, steps=steps, **settings)
+
+
+@pytest.fixture(scope="module")
+def whole(posterior: Posterior, estimate: MapEstimate, tmp_path_factory: pytest.TempPathFactory) -> Chain:
+    """A run that nothing disturbed."""
+    return run(posterior, estimate, tmp_path_factory.mktemp("whole") / "chain.h5")
+
+
+def draws_of(chain: Chain) -> Mapping[str, Any]:
+    return {"chain": chain.chain.tobytes(), "log_prob": chain.log_prob.tobytes(), "accepted": chain.accepted.tobytes()}
+
+
+def assert_same_file(a: Path, b: Path) -> None:
+    """Every dataset and attribute of two HDF5 files is the same, bit by bit."""
+
+    def content(path: Path) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+
+        def add(name: str, item: Any) -> None:
+            found[name] = item[()].tobytes() if isinstance(item, h5py.Dataset) else None
+            found.update({f"{name}@{key}": np.asarray(value).tolist() for key, value in item.attrs.items()})
+
+        with h5py.File(path, "r") as file:
+            add("/", file)
+            file.visititems(add)
+        return found
+
+    first, second = content(a), content(b)
+    assert first.keys() == second.keys()
+    assert [key for key in first if first[key] != second[key] and first[key] == first[key]] == []
+
+
+# --- runs -------------------------------------------------------------------------------------------------
+
+
+def test_a_chain_has_the_shapes_it_says(posterior: Posterior, estimate: MapEstimate, whole: Chain) -> None:
+    d = posterior.n_parameters
+    assert whole.chain.shape == (2, TOTAL, 8, d) and whole.log_prob.shape == (2, TOTAL, 8) and whole.accepted.shape == (2, 8)
+    assert whole.parameter_names == posterior.parameter_names and whole.seed == 1
+    assert whole.draws().shape == (2 * (TOTAL - whole.burn_in) * 8, d) and 0 <= whole.burn_in <= TOTAL // 2
+    assert np.array_equal(whole.log_prob[1, -1], posterior.log_prob(whole.chain[1, -1]))
+    moved = np.any(np.diff(whole.chain, axis=1) != 0, axis=-1).sum(axis=1)
+    assert np.all((whole.accepted == moved) | (whole.accepted == moved + 1))  # the first step's is not in the chain
+    assert whole.accepted.mean() > 0.7 * TOTAL
+    assert np.array_equal(whole.estimate.params, estimate.params)
+    assert {"bayesfred", "emcee", "numba", "numpy", "scipy", "python"} <= set(whole.versions)
+    assert not np.array_equal(whole.chain[0], whole.chain[1])
+
+
+def test_the_file_gives_the_chain_back(whole: Chain) -> None:
+    again = open_chain(str(whole.path))
+    assert draws_of(again) == draws_of(whole)
+    assert (again.parameter_names, again.burn_in, again.seed) == (whole.parameter_names, whole.burn_in, whole.seed)
+    assert again.versions == whole.versions and again.estimate.message == whole.estimate.message
+    tree = again.to_datatree()
+    shape = (2 * 8, TOTAL - again.burn_in)
+    assert tree["posterior"]["background"].shape == tree["sample_stats"]["lp"].shape == shape
+    assert np.array_equal(tree["posterior"]["f_ux"].values[8], again.chain[1, again.burn_in :, 0, 0])
+    assert np.array_equal(tree["sample_stats"]["lp"].values[9], again.log_prob[1, again.burn_in :, 1])
+
+
+def test_emcee_reads_the_file(whole: Chain) -> None:
+    for k in range(2):
+        backend = emcee.backends.HDFBackend(str(whole.path), name=f"ensemble_{k}", read_only=True)
+        assert (backend.iteration, backend.shape) == (TOTAL, (8, 13))
+        assert np.array_equal(backend.get_chain(), whole.chain[k])
+        assert np.array_equal(backend.get_log_prob(), whole.log_prob[k])
+        assert np.array_equal(backend.accepted, whole.accepted[k])
+        np.random.RandomState().set_state(backend.random_state)
+
+
+@pytest.mark.parametrize("stops", [(1,), (5,), (11,), (2, 7)])
+def test_a_resumed_run_is_the_uninterrupted_one(
+    posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path, stops: tuple[int, ...]
+) -> None:
+    path = tmp_path / "chain.h5"
+    for stop in (*stops, TOTAL):
+        chain = run(posterior, estimate, path, stop, resume=True)
+        assert chain.chain.shape[1] == stop
+    assert draws_of(chain) == draws_of(whole)
+    assert_same_file(path, whole.path)
+
+
+def test_a_resumed_run_needs_neither_estimate_nor_the_same_settings(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
+    # the file's own seed, numbers and estimate hold
+    path = tmp_path / "chain.h5"
+    run(posterior, whole.estimate, path, 5)
+    assert draws_of(run(posterior, None, path, resume=True, seed=99, ensembles=3, walkers=10)) == draws_of(whole)
+
+
+def test_steps_is_a_total(posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    for steps in (TOTAL, 3):
+        assert draws_of(run(posterior, estimate, path, steps, resume=True)) == draws_of(whole)
+    assert_same_file(path, whole.path)
+
+
+def test_a_run_to_a_target_resumes_to_the_same_draws(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
+    options = {"target_ess": 150.0, "walkers": 16}
+    whole = run(posterior, estimate, tmp_path / "a.h5", None, **options)
+    assert 8 <= whole.chain.shape[1] < 60
+    run(posterior, estimate, tmp_path / "b.h5", 7, **options)
+    assert draws_of(run(posterior, estimate, tmp_path / "b.h5", None, resume=True, **options)) == draws_of(whole)
+    assert draws_of(run(posterior, estimate, tmp_path / "b.h5", None, resume=True, **options)) == draws_of(whole)
+
+
+@pytest.mark.parametrize("nuisances", [Nuisances(), Nuisances("free")], ids=["fixed", "free"])
+def test_the_seed_alone_makes_the_draws(posterior: Posterior, tmp_path: Path, nuisances: Nuisances) -> None:
+    if nb.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one core")
+    posterior = Posterior(posterior.model, posterior.counts, nuisances=nuisances)
+    estimate, before = find_map(posterior), nb.get_num_threads()
+    chains = []
+    try:
+        for threads, seed in ((1, 1), (2, 1), (2, 2)):
+            nb.set_num_threads(threads)
+            chains.append(draws_of(run(posterior, estimate, tmp_path / f"{threads}{seed}.h5", 4, seed=seed)))
+    finally:
+        nb.set_num_threads(before)
+    assert chains[0] == chains[1] != chains[2]
+
+
+# --- refusals ---------------------------------------------------------------------------------------------
+
+
+def test_an_existing_file_is_refused_or_replaced(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    run(posterior, estimate, path, 2)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="exists, expected a new file"):
+        run(posterior, estimate, path, 2)
+    assert path.read_bytes() == before
+    assert run(posterior, estimate, path, 3, overwrite=True, seed=5).seed == 5
+    with pytest.raises(InputError, match="no folder"):
+        run(posterior, estimate, tmp_path / "absent" / "chain.h5")
+
+
+@pytest.mark.parametrize(
+    ("changed", "change"),
+    [
+        ("counts", lambda p: {"counts": p.counts + np.eye(60, 75)}),
+        ("mask", lambda p: {"mask": np.arange(75) > 2}),
+        ("noise", lambda p: {"noise": PoissonNoise(1.0)}),
+        ("nuisances", lambda p: {"nuisances": Nuisances(footprint=1e4)}),
+        ("prior", lambda p: {"prior": {"background": stats.halfnorm(0, 5.0)}}),
+        ("model", lambda p: {"model": make_model(sigma=2.6, tolerance=1e-8)}),
+        ("model", lambda p: {"model": make_model(SourceCatalog.grid(3, 17.0, 4001.0), tolerance=1e-8)}),
+        ("model", lambda p: {"model": make_model(tolerance=1e-9)}),
+        ("model", lambda p: {"model": make_model(tolerance=1e-8, conserve_flux=False)}),
+    ],
+)
+def test_another_posterior_is_refused(posterior: Posterior, whole: Chain, tmp_path: Path, changed: str, change: Any) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    fields: dict[str, Any] = {"model": posterior.model, "counts": posterior.counts, **change(posterior)}
+    if "mask" in fields:
+        fields["mask"] = np.broadcast_to(fields["mask"], (60, 75))
+    other = Posterior(fields.pop("model"), fields.pop("counts"), **fields)
+    names = [name for name, digest in fingerprint(other).items() if digest != fingerprint(posterior)[name]]
+    assert changed in names
+    with pytest.raises(InputError, match=f"made with other {', '.join(names)}, expected the same"):
+        run(other, whole.estimate, path, resume=True)
+    assert path.read_bytes() == whole.path.read_bytes()
+
+
+def test_a_second_writer_is_refused(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    with filelock.FileLock(tmp_path / ".chain.h5.lock"):
+        for options in ({"resume": True}, {"overwrite": True}):
+            with pytest.raises(InputError, match="another process is writing"):
+                run(posterior, whole.estimate, path, TOTAL + 1, **options)
+        assert draws_of(open_chain(path)) == draws_of(whole)  # readers do not mind
+    run(posterior, whole.estimate, path, TOTAL + 1, resume=True)
+
+
+@pytest.mark.parametrize("options", [{"ensembles": 1}, {"walkers": 5}, {"walkers": 2}, {"target_ess": 0.0}, {"steps": 0}])
+def test_numbers_are_checked(posterior: Posterior, estimate: MapEstimate, tmp_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=f"sampling: {next(iter(options))}: got"):
+        run(posterior, estimate, tmp_path / "chain.h5", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_estimate_off_the_posterior_is_refused(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
+    far = MapEstimate(estimate.params - np.eye(13)[12] * 1e3, estimate.covariance, 0.0, True, 1, "")
+    with pytest.raises(InputError, match="estimate: the posterior has no density"):
+        run(posterior, far, tmp_path / "chain.h5")
+
+
+# --- accidents --------------------------------------------------------------------------------------------
+
+
+class AccidentError(Exception):
+    """What the tests below make happen."""
+
+
+@pytest.mark.parametrize("where", ["open", "dataset", "attribute", "fsync", "rename"])
+def test_a_failed_write_leaves_the_old_file(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    owner, name, after = {
+        "open": (h5py.File, "__init__", 0),
+        "dataset": (h5py.Group, "create_dataset", 6),
+        "attribute": (h5py.AttributeManager, "__setitem__", 60),
+        "fsync": (os, "fsync", 0),
+        "rename": (os, "replace", 0),
+    }[where]
+    real, calls = getattr(owner, name), 0
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        nonlocal calls
+        calls += any(tmp_path.glob(".*.tmp")) or str(args[1:2]).count(".tmp")
+        if calls > after:
+            raise AccidentError
+        return real(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, fail)
+        with pytest.raises(AccidentError):
+            run(posterior, whole.estimate, path, TOTAL + 1, resume=True)
+    assert path.read_bytes() == whole.path.read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir() if "lock" not in p.name) == ["chain.h5"]
+    assert run(posterior, whole.estimate, path, TOTAL + 1, resume=True).chain.shape[1] == TOTAL + 1
+
+
+@pytest.mark.parametrize("calls", [3, 6, 7, 20, 37])
+def test_an_interrupted_run_keeps_its_complete_steps(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    # 2 calls place the walkers, emcee evaluates none again, and a step is 2 calls an ensemble
+    path, real, left = tmp_path / "chain.h5", Posterior.log_prob, calls
+
+    def interrupted(self: Posterior, params: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return real(self, params)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Posterior, "log_prob", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(posterior, whole.estimate, path)
+    complete = (calls - 2) // 4
+    assert path.exists() == (complete > 0)
+    if complete:
+        kept = open_chain(path)
+        assert np.array_equal(kept.chain, whole.chain[:, :complete])
+    assert not list(tmp_path.glob(".*.tmp"))
+    assert draws_of(run(posterior, whole.estimate, path, resume=True)) == draws_of(whole)
+    assert_same_file(path, whole.path)
+
+
+def damaged(whole: Path, how: str) -> bytes:
+    raw = bytearray(whole.read_bytes())
+    if how == "text":
+        return b"u,v\n1,2\n"
+    if how == "flipped":
+        with h5py.File(whole, "r") as file:
+            raw[file["ensemble_1/chain"].id.get_chunk_info(0).byte_offset + 100] ^= 1
+        return bytes(raw)
+    return bytes(raw[: int(float(how) * len(raw))])
+
+
+@pytest.mark.parametrize("how", ["text", "flipped", "0", "0.01", "0.5", "0.99"])
+def test_damaged_files_are_refused(posterior: Posterior, whole: Chain, tmp_path: Path, how: str) -> None:
+    path = tmp_path / "chain.h5"
+    path.write_bytes(damaged(whole.path, how))
+    with pytest.raises(InputError, match=r"chain\.h5: "):
+        open_chain(path)
+    with pytest.raises(InputError, match=r"chain\.h5: "):
+        run(posterior, whole.estimate, path, resume=True)
+
+
+def test_missing_and_foreign_files_are_refused(whole: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    for absent in (path, tmp_path):
+        with pytest.raises(InputError, match="no such file"):
+            open_chain(absent)
+    with h5py.File(path, "w") as file:
+        file["image"] = np.zeros(3)
+    with pytest.raises(InputError, match="got None of schema None"):
+        open_chain(path)
+    for spoil in ("schema", "kind"):
+        shutil.copy(whole.path, path)
+        with h5py.File(path, "a") as file:
+            file.attrs[spoil] = 99
+        with pytest.raises(InputError, match="expected 'bayesfred chain' of schema"):
+            open_chain(path)
+
+
+@pytest.mark.parametrize("part", ["estimate", "versions", "ensemble_1", "ensemble_0/chain", "estimate/params"])
+def test_incomplete_files_are_refused(whole: Chain, tmp_path: Path, part: str) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    with h5py.File(path, "a") as file:
+        del file[part]
+    with pytest.raises(InputError, match=r"chain\.h5: "):
+        open_chain(path)
+
+
+# --- the posterior in the file ----------------------------------------------------------------------------
+
+POSTERIORS: list[tuple[Nuisances, Any, Detector, bool]] = [
+    (Nuisances(), PoissonNoise(), Detector((60, 75)), True),
+    (Nuisances("scale", footprint=12.5), BackgroundNoise(), Detector((60, 75)), False),
+    (Nuisances("free", psf_sigma=True, background_order=1), PoissonNoise(1.25), Detector((30, 37), 2, "box"), True),
+    (EVERYTHING, PoissonNoise(), Detector((20, 25), 3), True),
+]
+
+
+@pytest.mark.parametrize(("nuisances", "noise", "detector", "conserve_flux"), POSTERIORS)
+def test_the_posterior_is_rebuilt(
+    tmp_path: Path, nuisances: Nuisances, noise: Any, detector: Detector, conserve_flux: bool
+) -> None:
+    rng = np.random.default_rng(51)
+    model = make_model(detector=detector, tolerance=1e-8, conserve_flux=conserve_flux)
+    prior = {"f_ux": stats.t(4.0, 0.0, 1e-3), "background": stats.gamma(2.0, scale=3.0), "g_uy": stats.uniform(-1e-2, 2e-2)}
+    mask = rng.random(detector.shape) < 0.9
+    options = {"nuisances": nuisances, "noise": noise, "prior": prior, "mask": mask}
+    posterior, truth = make_posterior(model, make_truth(model, rng), rng, **options)
+    covariance = np.linalg.inv(posterior.information(truth))
+    estimate = MapEstimate(truth, 0.5 * (covariance + covariance.T), posterior.log_prob(truth), True, 1, "the truth")
+    chain = run(posterior, estimate, tmp_path / "chain.h5", 2)
+    again = open_chain(chain.path).posterior()
+    points = chain.chain[:, -1].reshape(-1, truth.size)
+    assert again.log_prob(points).tobytes() == posterior.log_prob(points).tobytes()
+    assert np.isfinite(again.log_prob(points)).all() and math.isfinite(again.log_prob(truth))
+    assert np.array_equal(again.gradient(truth), posterior.gradient(truth), equal_nan=True)
+    assert (again.parameter_names, again.noise, again.nuisances) == (posterior.parameter_names, noise, nuisances)
+    assert fingerprint(again) == fingerprint(posterior)
