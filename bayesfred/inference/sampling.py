@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.inference.chainfile import Chain, check_same_posterior, open_chain, random_states, write_chain
@@ -108,7 +109,8 @@ def sample(
             run = _Run.resumed(posterior, open_chain(path), random_states(path))
         else:
             run = _Run.begun(posterior, estimate or find_map(posterior), path, seed, ensembles, walkers)
-        return run.until(target_ess, steps, progress)
+        with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin, and take half the likelihood's cores
+            return run.until(target_ess, steps, progress)
 
 
 def _check_numbers(ensembles: int, walkers: int, target_ess: float, steps: int | None) -> None:
