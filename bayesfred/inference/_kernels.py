@@ -35,7 +35,9 @@ from bayesfred.imaging._kernels import (
     REDUCE,
     SEGMENT,
     Floats,
+    Footprints,
     Ints,
+    Maps,
     add_jacobian_rows,
     add_pixels,
     add_source,
@@ -168,7 +170,8 @@ def _next_run(flags, span, per_row, j, k):
 
 
 @nb.njit(cache=True)
-def _clear(w):
+def clear(w):
+    """Make a workspace's image zero again."""
     per_row = w.flags.size // w.span.shape[0]
     for j in range(w.span.shape[0]):
         if w.span[j, 1] >= 0:
@@ -562,7 +565,7 @@ def _log_likelihood_at(o, counts, w, theta, nuisances, background, flux, free):
     value = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, np.empty(flux.size))[0]
     if value > -math.inf:
         value += _log_likelihood(counts, w, background)
-    _clear(w)
+    clear(w)
     return value
 
 
@@ -574,20 +577,29 @@ def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, firs
             out[i] = _log_likelihood_at(o, counts, w, theta[i], nuisances[i], background[i], flux, free)
 
 
+class Drawn(NamedTuple):
+    """The sources as they are drawn in a workspace's image, and what the derivatives need of them."""
+
+    possible: bool  # False where a map folds, or the fluxes have no maximum
+    maps: Maps
+    footprints: Footprints
+    boxes: Ints
+    clusters: Clusters
+    stamps: Floats
+    factors: Floats
+    fluxes: Floats
+
+
 @nb.njit(cache=True, nogil=True)
-def expected(o, counts, w, theta, nuisances, background, flux, free, fitted, out):
-    """Sources plus background into `out` (ny, padded row), the fluxes into `fitted`; False if a map folds or the fit fails."""
+def draw(o, counts, w, theta, nuisances, background, flux, free):
+    """Draw all sources; whoever uses the image clears the workspace."""
     maps = new_maps(o)
-    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
-        return False
-    extra = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted)[0]
-    for j in range(o.ny):
-        c0, c1, c2 = _background_row(background, j, o.ny)
-        for i in range(o.nx):
-            u = (2 * i - o.nx + 1) / o.nx
-            out[j, i] = w.image[j * out.shape[1] + i] + (c0 + u * (c1 + u * c2))
-    _clear(w)
-    return extra > -math.inf
+    possible = locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps)
+    if not possible:
+        maps.rows[:] = 0
+    fluxes = np.empty(flux.size)
+    extra, fp, boxes, clusters, stamps, factors = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fluxes)
+    return Drawn(possible and extra > -math.inf, maps, fp, boxes, clusters, stamps, factors, fluxes)
 
 
 @nb.njit(cache=True)
@@ -661,24 +673,15 @@ def _laplace_adjoint(w, fp, boxes, clusters, stamps, factors, flux, curve):
 
 
 @nb.njit(cache=True, nogil=True)
-def gradient(o, counts, w, theta, nuisances, background, flux, free, basis, out, out_background):
+def gradient(o, counts, w, drawn, sigma, background, free, basis, out, out_background):
     """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`."""
-    maps = new_maps(o)
-    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
-        return False
-    fitted = np.empty(flux.size)
-    extra, fp, boxes, clusters, stamps, factors = _draw_sources(
-        o, counts, w, maps, nuisances, background, flux, free, fitted
-    )
-    if extra == -math.inf:
-        _clear(w)
-        return False
+    maps, fp, stamps, fitted = drawn.maps, drawn.footprints, drawn.stamps, drawn.fluxes
     curve = np.empty(w.image.size)
     _weigh(counts, w, background, curve)
     image = w.score
-    z, mixed = np.zeros(flux.size), np.empty(0)
+    z, mixed = np.zeros(fitted.size), np.empty(0)
     if free:
-        z, mixed, image = _laplace_adjoint(w, fp, boxes, clusters, stamps, factors, fitted, curve)
+        z, mixed, image = _laplace_adjoint(w, fp, drawn.boxes, drawn.clusters, stamps, drawn.factors, fitted, curve)
     _background_gradient(counts, w, background, image, out_background)
     pitch = w.image.size // o.ny
     work = new_work(o)
@@ -697,13 +700,11 @@ def gradient(o, counts, w, theta, nuisances, background, flux, free, basis, out,
                 q = fp.start[p]
                 for k in range(n):
                     c[k] += z[s] * w.score[at + k] - w.weight[at + k] * mixed[q + k]
-            basis_row(o, maps, basis, s, j, low, n, nuisances[3], rows, samples, powers, work)
+            basis_row(o, maps, basis, s, j, low, n, sigma, rows, samples, powers, work)
             for k in range(moments.size):
                 moments[k] += _dot(rows[k, :n], c[:n], ones[:n])
         for k in range(basis.row.size):
             out[k] += basis.lever[s, k] * moments[basis.row[k]]
-    _clear(w)
-    return True
 
 
 @nb.njit(cache=True)
@@ -758,33 +759,24 @@ BAND = 16  # rows of the Jacobian held at a time
 
 
 @nb.njit(cache=True, nogil=True)
-def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis, out):
+def fisher(o, counts, w, drawn, sigma, background, terms, free, basis, out):
     """Fisher information of source parameters, then the first `terms` background coefficients, fluxes profiled out.
 
     I = sum over pixels of J J^T / mu, band by band of rows; with free fluxes the Schur complement
     I - C I_FF^-1 C^T, where I_FF carries the prior's 1/F^2.
     """
-    maps = new_maps(o)
-    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
-        return False
-    fitted = np.empty(flux.size)
-    extra, fp, boxes, clusters, stamps, factors = _draw_sources(
-        o, counts, w, maps, nuisances, background, flux, free, fitted
-    )
-    if extra == -math.inf:
-        _clear(w)
-        return False
+    fp, boxes, clusters, stamps, fitted = drawn.footprints, drawn.boxes, drawn.clusters, drawn.stamps, drawn.fluxes
     pixels = _fisher_weight(counts, w, background)
     ny, pitch = o.ny, w.image.size // o.ny
     per_row = w.flags.size // ny
     sources = basis.row.size
     size = sources + terms
-    cross = np.zeros((flux.size, size))
+    cross = np.zeros((fitted.size, size))
     band = np.empty((size, BAND, pitch))
     for top in range(0, ny, BAND):
         last = min(top + BAND, ny)
         band[:] = 0.0
-        add_jacobian_rows(o, maps, fp, basis, fitted, nuisances[3], top, last, band)
+        add_jacobian_rows(o, drawn.maps, fp, basis, fitted, sigma, top, last, band)
         for j in range(top, last):
             v = (2 * j - ny + 1) / ny
             for i in range(pitch):
@@ -805,7 +797,7 @@ def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis,
                         out[k, m] += _dot(left, band[m, j - top, a:b], weight)
                 start, stop = _next_run(w.flags, w.span, per_row, j, stop)
         if free:
-            for s in range(flux.size):
+            for s in range(fitted.size):
                 for j in range(max(top, boxes[s, 0]), min(last, boxes[s, 1])):
                     i = fp.first[s] + j - boxes[s, 0]
                     a, b = fp.low[i], fp.low[i] + fp.size[i]
@@ -817,13 +809,11 @@ def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis,
         for c in range(clusters.first.size - 1):
             members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
             n = members.size
-            h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
+            h = drawn.factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
             _gram(fp, boxes, members, stamps, w.weight, pitch, h)
             for i in range(n):
                 h[i, i] += 1.0 / fitted[members[i]] ** 2
-            if not _cholesky(h):
-                _clear(w)
-                return False
+            _cholesky(h)  # positive definite: the prior's curvature is
             column = np.empty(n)
             for m in range(size):
                 for i in range(n):
@@ -835,5 +825,3 @@ def fisher(o, counts, w, theta, nuisances, background, terms, flux, free, basis,
     for k in range(size):
         for m in range(k):
             out[m, k] = out[k, m]
-    _clear(w)
-    return True

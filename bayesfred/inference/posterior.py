@@ -6,8 +6,9 @@ derivatives are in `_kernels.py`; `estimate.py` finds the maximum, `sampling.py`
 
 import os
 import queue
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -170,6 +171,12 @@ def _footprint(model: ForwardModel, radius: float) -> npt.NDArray[np.bool_]:
     return inside
 
 
+def _square(background: Floats) -> Floats:
+    """The background's coefficients of 1, u, v, u^2, uv, v^2 as a matrix [power of u, power of v]."""
+    b = background
+    return np.array([[b[0], b[2], b[5]], [b[1], b[4], 0.0], [b[3], 0.0, 0.0]])
+
+
 @dataclass(frozen=True, eq=False, init=False)
 class Posterior:
     """Posterior of distortion, background and nuisances given a frame.
@@ -293,8 +300,10 @@ class Posterior:
         threads = min(numba.get_num_threads(), len(vectors))
 
         def evaluate(first: int) -> None:
-            self._use(lambda w: _kernels.log_likelihoods(
-                self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out))  # fmt: skip
+            with self._workspace() as w:
+                _kernels.log_likelihoods(
+                    self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out
+                )
 
         if threads == 1:
             evaluate(0)
@@ -319,8 +328,11 @@ class Posterior:
             return np.full(vector.size, np.nan)
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
-        self._use(lambda w: _kernels.gradient(
-            self._optics, self._frame, w, *arguments, self._flux, self._free, self._basis, sources, background))  # fmt: skip
+        with self._drawn(arguments) as (w, drawn):
+            sigma, level = arguments[1][3], arguments[2]
+            _kernels.gradient(
+                self._optics, self._frame, w, drawn, sigma, level, self._free, self._basis, sources, background
+            )
         if isinstance(self.noise, BackgroundNoise):
             level = arguments[2][0]
             residual = self.counts - self.expected_counts(vector)
@@ -346,8 +358,9 @@ class Posterior:
         terms = len(self.nuisances.background_names)
         size = self._basis.row.size + terms
         out = np.zeros((size, size))
-        self._use(lambda w: _kernels.fisher(
-            self._optics, self._frame, w, *arguments, terms, self._flux, self._free, self._basis, out))  # fmt: skip
+        with self._drawn(arguments) as (w, drawn):
+            sigma, level = arguments[1][3], arguments[2]
+            _kernels.fisher(self._optics, self._frame, w, drawn, sigma, level, terms, self._free, self._basis, out)
         if isinstance(self.noise, BackgroundNoise):
             k = self._basis.row.size
             out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
@@ -380,12 +393,12 @@ class Posterior:
         vector = self._vectors(params)[0]
         arguments = [a[0] for a in self._arguments(vector[None])]
         ny, nx = self.model.detector.shape
-        fluxes, out = np.empty(self._flux.size), np.empty((ny, stride(nx)))
-        ok = self._use(lambda w: _kernels.expected(
-            self._optics, self._frame, w, *arguments, self._flux, self._free, fluxes, out))  # fmt: skip
-        if not ok:
-            out[:] = fluxes[:] = np.nan
-        return out[:, :nx] - self.noise.shift, fluxes
+        with self._drawn(arguments) as (w, drawn):
+            sources = w.image.reshape(ny, -1)[:, :nx].copy()
+        u, v = (np.arange(1 - n, n, 2) / n for n in (nx, ny))
+        background = np.polynomial.polynomial.polyval2d(*np.meshgrid(u, v), _square(arguments[2]))
+        bad = 0.0 if drawn.possible else np.nan
+        return sources + background - self.noise.shift + bad, drawn.fluxes + bad
 
     def start(self) -> Floats:
         """Parameters to begin a search from: no distortion, the frame's median as background, nuisances as given."""
@@ -417,16 +430,23 @@ class Posterior:
         terms = len(self.nuisances.background_names)
         return np.concatenate([sources, background[:terms]])[self._order]
 
-    def _use(self, function: Callable[[_kernels.Workspace], Any]) -> Any:
-        """Call a function with a workspace that no other thread uses meanwhile."""
+    @contextmanager
+    def _workspace(self) -> Iterator[_kernels.Workspace]:
+        """A workspace that no other thread uses meanwhile."""
         try:
             workspace = self._workspaces.get_nowait()
         except queue.Empty:
             ny, nx = self.model.detector.shape
             workspace = _kernels.new_workspace(ny, stride(nx))
-        result = function(workspace)
+        yield workspace
         self._workspaces.put(workspace)
-        return result
+
+    @contextmanager
+    def _drawn(self, arguments: list[Floats]) -> Iterator[tuple[_kernels.Workspace, _kernels.Drawn]]:
+        """A workspace in which the sources are drawn, for one set of arguments."""
+        with self._workspace() as w:
+            yield w, _kernels.draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
+            _kernels.clear(w)
 
     @cached_property
     def _workspaces(self) -> "queue.SimpleQueue[_kernels.Workspace]":
