@@ -1,0 +1,121 @@
+"""How fast the package is: `python -m benchmarks` prints measure, ratio, bound and whether it is met.
+
+Every row is a ratio of times within one run, the median of interleaved repetitions, so that it says something about the code
+and little about the machine. The problem is the paper's frame: 505 x 505 pixels, 81 sources, sigma 10, tolerance 1e-8.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import bayesfred as bf
+
+THETA = np.array([0.0, 2e-6, 0.0, -2e-6, 1e-6, 2e-6, 0.0, 3e-6, 0.0, 1e-6, 1e-6, -1e-6])
+SAMPLES = 960_000  # kernel samples of the paper's frame at this tolerance
+
+
+def model(shape: tuple[int, int] = (505, 505), side: int = 9) -> bf.ForwardModel:
+    sources = bf.SourceCatalog.grid(side, 50.0, 1e5)
+    return bf.ForwardModel(bf.Detector(shape), sources, bf.GaussianPSF(10.0), bf.PolynomialDistortion.mirrored())
+
+
+def ratio(work: Callable[[], object], unit: Callable[[], object], repetitions: int) -> float:
+    """Median time of `work` over that of `unit`, run in turn."""
+    work(), unit()
+    times = np.empty((repetitions, 2))
+    for row in times:
+        for k, function in enumerate((work, unit)):
+            start = time.perf_counter()
+            function()
+            row[k] = time.perf_counter() - start
+    above, below = np.median(times, axis=0)
+    return float(above / below)
+
+
+def with_threads(n: int, work: Callable[[], object]) -> Callable[[], object]:
+    def run() -> object:
+        numba.set_num_threads(n)
+        return work()
+
+    return run
+
+
+def dense_image(m: bf.ForwardModel) -> np.ndarray:
+    """Every pixel of every source in plain NumPy."""
+    u, v = m.detector.pixel_centres()
+    u, v = u[None, :], v[:, None]
+    out = np.zeros(m.detector.shape)
+    for x, y, flux in zip(m.sources.x, m.sources.y, m.sources.flux, strict=True):
+        f, g = m.distortion.displacement(THETA, u, v, x, y)
+        size = np.abs(m.distortion.determinant(THETA, u, v, x, y))
+        r2 = (u - x + f) ** 2 + (v - y + g) ** 2
+        out += flux * size * np.exp(-r2 / 200.0) / (200.0 * np.pi)
+    return out
+
+
+def main() -> int:
+    m = model()
+    posterior = bf.Posterior(m, bf.simulate(m, THETA, 5.0, seed=1))
+    truth = np.append(THETA, 5.0)
+    walkers = np.tile(truth, (32, 1))
+    x, out = -20.0 * np.random.default_rng(1).random(SAMPLES), np.empty(SAMPLES)
+
+    def exp() -> object:
+        return np.exp(x, out=out)
+
+    far = model((1010, 1010))  # the same sources in four times the empty frame
+    empty = bf.Posterior(far, bf.simulate(far, THETA, 5.0, seed=1))
+    many = model((505, 1010))
+    doubled = bf.SourceCatalog(
+        np.concatenate([m.sources.x - 252.0, m.sources.x + 252.0]), np.tile(m.sources.y, 2), np.tile(m.sources.flux, 2)
+    )
+    plain = np.zeros(12)
+    twice = bf.ForwardModel(many.detector, doubled, m.psf, m.distortion)
+    once = bf.ForwardModel(many.detector, m.sources, m.psf, m.distortion)
+
+    def fit() -> bf.MapEstimate:
+        return bf.find_map(posterior)
+
+    def sample() -> bf.Chain:
+        with tempfile.TemporaryDirectory() as folder:
+            return bf.sample(posterior, fit(), path=Path(folder) / "chain.h5", seed=1, progress=False)
+
+    estimate = fit()
+    chain = sample()
+    diagnostics = bf.diagnose(chain)
+    least = min(min(diagnostics.ess_bulk.values()), min(diagnostics.ess_tail.values()))
+    draws = float(np.prod(chain.chain.shape[:3]))
+    one = with_threads(1, exp)
+    rows = [
+        ("expected counts / np.exp of as many samples", ratio(lambda: m.expected_counts(THETA, 5.0), exp, 40), 1.5),
+        ("log-posterior per walker / np.exp", ratio(with_threads(1, lambda: posterior.log_prob(truth)), one, 40), 2.2),
+        (
+            "32 walkers, 2 threads / 1 thread",
+            ratio(with_threads(2, lambda: posterior.log_prob(walkers)), with_threads(1, lambda: posterior.log_prob(walkers)), 8),
+            0.6,
+        ),
+        ("Fisher information / np.exp", ratio(with_threads(1, lambda: posterior.fisher(truth)), one, 10), 25.0),
+        ("MAP from a cold start / np.exp", ratio(with_threads(2, fit), exp, 3), 500.0),
+        ("likelihoods per effective draw", draws / least, 1.3),
+        ("MAP and 1,000 effective draws / one dense NumPy image", ratio(with_threads(2, sample), lambda: dense_image(m), 3), 3.0),
+        ("twice the sources", ratio(lambda: twice.expected_counts(plain), lambda: once.expected_counts(plain), 20), 2.1),
+        ("four times the empty frame", ratio(lambda: empty.log_prob(truth), lambda: posterior.log_prob(truth), 20), 1.1),
+    ]
+    table = Table(title=f"{estimate.n_evaluations} likelihoods to the maximum, {draws:.0f} for {least:.0f} effective draws")
+    for head in ("measure", "ratio", "bound", "met"):
+        table.add_column(head, justify="left" if head == "measure" else "right")
+    for name, value, bound in rows:
+        table.add_row(name, f"{value:.2f}", f"{bound:g}", "yes" if value <= bound else "no")
+    Console(width=None if sys.stdout.isatty() else 110).print(table)
+    return 0 if all(value <= bound for _, value, bound in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
