@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import corner
 import numpy as np
@@ -148,7 +149,7 @@ def corner_plot(
         contour_kwargs={"linewidths": 0.7},
         hist_kwargs={"linewidth": 1.0},
     )
-    marked = []
+    marked: list[tuple[str, str, Any]] = []
     for values, colour, style, label in (
         (truth, TRUTH_COLOUR, "-", "truth"),
         (estimate, ESTIMATE_COLOUR, "--", "MAP"),
@@ -350,7 +351,8 @@ def overview(
     z = (mean if truth is None else mean - truth)[kept] / sd[kept]
     heights = (TRIPTYCH_MARGIN + TRIPTYCH_SIDE * counts.shape[0] / counts.shape[1], 3.4)
     fig = Figure(figsize=(19, sum(heights)), dpi=100, layout="constrained")
-    upper, lower = fig.subfigures(2, 1, height_ratios=heights)
+    parts: Any = fig.subfigures(2, 1, height_ratios=heights)  # an array, whatever the stubs of the version say
+    upper, lower = parts
     _draw_triptych(fig, upper.subplots(1, 3), counts, expected, mask)
     ax = lower.subplots()
     place = np.arange(len(kept))
