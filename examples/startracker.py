@@ -39,7 +39,7 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
     """Print the cubic terms beside those from centroids, and how far the stars scatter about the fit."""
     names = list(chain.parameter_names)
     draws = chain.draws()
-    scatter, ratio = star_scatter(run_file, chain)
+    mean_u, mean_v, error, scatter, ratio = star_scatter(run_file, chain)
     print("\ncubic terms, pixel at 512 pixels from the middle")
     print("term    posterior          centroids   difference / error")
     worst = 0.0
@@ -50,10 +50,11 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
         worst = max(worst, abs(z))
         print(f"{name:6}  {mean:.3f} +- {sd:.3f}    {centroid:.2f}        {z:+.1f}")
     print(
-        f"The frame's centroids scatter about this fit by {scatter:.3f} pixel, {ratio:.1f} times their errors from photon noise:\n"
-        "catalogue positions (proper motion since the catalogue's epoch, close pairs) and a PSF that is no Gaussian in the\n"
-        "1.5 pixels it covers. The posterior knows photon noise alone, so its errors are too small by about that factor,\n"
-        "which the last column allows for."
+        f"In the mean the frame's centroids lie {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}) pixel from this fit: the residuals\n"
+        f"have no dipole in common. Single stars scatter by {scatter:.3f} pixel, {ratio:.1f} times their errors from photon\n"
+        "noise, which the brightest show as dipoles of either sign: catalogue positions (proper motion since the\n"
+        "catalogue's epoch, close pairs), and a PSF that is no Gaussian in the 1.5 pixels that it covers. The posterior\n"
+        "knows photon noise alone, so its errors are too small by about that factor, which the last column allows for."
     )
     if worst < 3:
         print("Posterior and centroids agree within 3 such errors.")
@@ -61,8 +62,11 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
         print("Posterior and centroids do not all agree: few of one frame's stars are in the corners that fix x^3 and y^3.")
 
 
-def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float]:
-    """Root mean square distance per axis of the stars' centroids from the fit: in pixels, and in units of their errors."""
+def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float, float, float, float]:
+    """How the stars' centroids lie about the fit.
+
+    Mean along u and v with its error, root mean square per axis, pixel; and the latter in units of the centroids' errors.
+    """
     run = settings.read_settings(run_file)
     catalogue = settings.resolve(run.catalogue.path, run_file, must_exist=True)
     stars = read(catalogue, "hip", "x", "y")
@@ -77,7 +81,10 @@ def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float]:
     off = np.stack([u - (x - f + params["offset_x"]), v - (y - g + params["offset_y"])])
     error = np.stack([error_u, error_v])
     weight = error**-2.0
-    return float(np.sqrt(np.sum(weight * off**2) / np.sum(weight))), float(np.sqrt(np.mean((off / error) ** 2)))
+    mean_u, mean_v = np.sum(weight * off, axis=1) / np.sum(weight, axis=1)
+    scatter = np.sqrt(np.sum(weight * off**2) / np.sum(weight))
+    error_of_mean = scatter * np.sqrt(np.mean(np.sum(weight**2, axis=1) / np.sum(weight, axis=1) ** 2))
+    return mean_u, mean_v, error_of_mean, scatter, np.sqrt(np.mean((off / error) ** 2))
 
 
 def read(path: Path, *columns: str) -> list[list[float]]:
