@@ -83,9 +83,10 @@ def main() -> int:
     def fit() -> bf.MapEstimate:
         return bf.find_map(posterior)
 
+    folder = tempfile.TemporaryDirectory()
+
     def sample() -> bf.Chain:
-        with tempfile.TemporaryDirectory() as folder:
-            return bf.sample(posterior, fit(), path=Path(folder) / "chain.h5", seed=1, progress=False)
+        return bf.sample(posterior, fit(), path=Path(folder.name) / "chain.h5", seed=1, overwrite=True, progress=False)
 
     estimate = fit()
     chain = sample()
@@ -108,6 +109,7 @@ def main() -> int:
         ("twice the sources", ratio(lambda: twice.expected_counts(plain), lambda: once.expected_counts(plain), 20), 2.1),
         ("four times the empty frame", ratio(lambda: empty.log_prob(truth), lambda: posterior.log_prob(truth), 20), 1.1),
     ]
+    folder.cleanup()
     table = Table(title=f"{estimate.n_evaluations} likelihoods to the maximum, {draws:.0f} for {least:.0f} effective draws")
     for head in ("measure", "ratio", "bound", "met"):
         table.add_column(head, justify="left" if head == "measure" else "right")
