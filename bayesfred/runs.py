@@ -287,7 +287,10 @@ def _report(
     )  # fmt: skip
     picture = chain.path.with_suffix(".png")
     expected = posterior.expected_counts(chain.estimate.params)
-    figure = plots.overview(posterior.counts, expected, posterior.mask, chain.draws(), chain.parameter_names, truth=truth)
+    sigma = posterior.sigma(chain.estimate.params)
+    figure = plots.overview(
+        posterior.counts, expected, sigma, posterior.mask, chain.draws(), chain.parameter_names, truth=truth
+    )
     figure.savefig(picture, dpi=150)
     print(f"{diagnostics.message}\nchain   {chain.path}\nreport  {page}\npicture {picture}")
     return Result(chain, diagnostics)

@@ -52,9 +52,9 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
     print(
         f"In the mean the frame's centroids lie {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}) pixel from this fit: the residuals\n"
         f"have no dipole in common. Single stars scatter by {scatter:.3f} pixel, {ratio:.1f} times their errors from photon\n"
-        "noise, which the brightest show as dipoles of either sign: catalogue positions (proper motion since the\n"
-        "catalogue's epoch, close pairs), and a PSF that is no Gaussian in the 1.5 pixels that it covers. The posterior\n"
-        "knows photon noise alone, so its errors are too small by about that factor, which the last column allows for."
+        "noise, which the brightest show as dipoles of either sign. Likely causes: catalogue positions (proper motion\n"
+        "since the catalogue's epoch, close pairs), and a PSF that is no Gaussian in the 1.5 pixels that it covers. The\n"
+        "posterior knows photon noise alone: its errors are too small by about that factor, which the last column allows for."
     )
     if worst < 3:
         print("Posterior and centroids agree within 3 such errors.")

@@ -427,3 +427,22 @@ def test_workspaces_return_to_the_queue() -> None:
         posterior.gradient(truth)
     assert isinstance(posterior._workspaces, queue.SimpleQueue)
     assert posterior._workspaces.qsize() <= nb.config.NUMBA_NUM_THREADS
+
+
+@pytest.mark.parametrize("noise", [PoissonNoise(), PoissonNoise(3.0), BackgroundNoise()])
+def test_sigma_is_the_spread_of_drawn_counts(noise: PoissonNoise | BackgroundNoise) -> None:
+    model = make_model()
+    theta, level, n = np.zeros(model.distortion.n_terms), 4.0, 2000
+    posterior = Posterior(model, np.full(model.detector.shape, 4.0), noise=noise)
+    rng = np.random.default_rng(40)
+    block = np.s_[24:36, 31:43]  # a source in the middle of the frame
+    sources = model.expected_counts(theta)[block]
+    drawn = np.stack([noise.draw(sources, level, rng) for _ in range(n)])
+    sigma = posterior.sigma(np.append(theta, level))[block]
+    ratio = np.mean(drawn.var(axis=0, ddof=1) / sigma**2)
+    # the variance of a Poisson variance estimate is (2 + 1 / mean) / n of its square, the mean is at least 4
+    error = math.sqrt((2 + 1 / level) / n / sigma.size)
+    assert abs(ratio - 1) < LIMIT * error
+    # negative control: the root of the model's counts is the spread of plain photon noise alone
+    plain = np.mean(drawn.var(axis=0, ddof=1) / (sources + level))
+    assert (abs(plain - 1) > LIMIT * error) == (noise != PoissonNoise())

@@ -45,7 +45,7 @@ class Noise(Protocol):
 
 
 @dataclass(frozen=True)
-class PoissonNoise:
+class PoissonNoise(Noise):
     """Photon noise, with read noise as the shifted Poisson distribution.
 
     Counts are Poisson(mean). Gaussian read noise of variance r^2 is matched in mean and variance by treating
@@ -103,7 +103,7 @@ class PoissonNoise:
 
 
 @dataclass(frozen=True)
-class BackgroundNoise:
+class BackgroundNoise(Noise):
     """The paper's noise: the sources' image is exact and only the background, Poisson(lambda), is random.
 
     A frame is the source image plus Poisson(lambda). It is fitted as a Gaussian of mean source image + lambda and variance

@@ -385,6 +385,11 @@ class Posterior:
         """
         return self._expected(params)[0]
 
+    def sigma(self, params: npt.ArrayLike) -> Floats:
+        """Standard deviation of every pixel's counts under the noise model, shape (ny, nx)."""
+        level = self._vectors(params)[0][self.parameter_names.index("background")]
+        return np.asarray(self.noise.fisher_weight(self.expected_counts(params), level) ** -0.5)
+
     def fluxes(self, params: npt.ArrayLike) -> Floats:
         """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
         return self._expected(params)[1]

@@ -176,17 +176,18 @@ def _figures(
     """Heading, caption and data URI of each figure."""
     counts, mask = posterior.counts, posterior.mask
     expected = posterior.expected_counts(chain.estimate.params)
+    sigma = posterior.sigma(chain.estimate.params)
     u, v, half_width = _star_positions(chain, posterior)
     return [
         (
             "Frame, model and residual",
             "At the MAP. Grey pixels do not enter the likelihood.",
-            _data_uri(plots.frame_triptych(counts, expected, mask)),
+            _data_uri(plots.frame_triptych(counts, expected, sigma, mask)),
         ),
         (
             "Brightest sources",
             "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced source.",
-            _data_uri(plots.star_panels(counts, expected, mask, u, v, half_width=half_width)),
+            _data_uri(plots.star_panels(counts, expected, sigma, mask, u, v, half_width=half_width)),
         ),
         (
             "Posterior",

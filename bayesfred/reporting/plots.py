@@ -238,12 +238,13 @@ def trace_plot(chain: Chain) -> Figure:
     return fig
 
 
-def frame_triptych(counts: Floats, expected: Floats, mask: Mask) -> Figure:
+def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> Figure:
     """The frame, the model on the same scale, and their difference in standard deviations.
 
     Parameters
     ----------
-    counts, expected : ndarray, shape (ny, nx), counts per pixel
+    counts, expected, sigma : ndarray, shape (ny, nx), counts per pixel
+        Frame, model, and the standard deviation that the noise model gives each pixel.
     mask : ndarray of bool, shape (ny, nx)
         True where a pixel enters the likelihood; the others are grey in the residual, and in the frame if they are empty.
 
@@ -253,12 +254,12 @@ def frame_triptych(counts: Floats, expected: Floats, mask: Mask) -> Figure:
     """
     height = TRIPTYCH_MARGIN + TRIPTYCH_SIDE * counts.shape[0] / counts.shape[1]
     fig = Figure(figsize=(19, height), dpi=100, layout="constrained")
-    _draw_triptych(fig, fig.subplots(1, 3), counts, expected, mask)
+    _draw_triptych(fig, fig.subplots(1, 3), counts, expected, sigma, mask)
     return fig
 
 
 def star_panels(
-    counts: Floats, expected: Floats, mask: Mask, u: Floats, v: Floats, *, half_width: int
+    counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: Floats, v: Floats, *, half_width: int
 ) -> Figure:
     """Cut-outs around the brightest sources: counts, model and residual side by side.
 
@@ -267,7 +268,8 @@ def star_panels(
 
     Parameters
     ----------
-    counts, expected : ndarray, shape (ny, nx), counts per pixel
+    counts, expected, sigma : ndarray, shape (ny, nx), counts per pixel
+        Frame, model, and the standard deviation that the noise model gives each pixel.
     mask : ndarray of bool, shape (ny, nx)
         True where a pixel enters the likelihood; the others are grey in counts and residual.
     u, v : ndarray, shape (n_sources,), pixel
@@ -294,7 +296,7 @@ def star_panels(
     if not shown.size:
         fig.text(0.5, 0.5, "no source lies in the frame", ha="center", va="center")
         return fig
-    used, sigma = _recorded(counts, mask), _residual(counts, expected, mask)
+    used, residual = _recorded(counts, mask), _residual(counts, expected, sigma, mask)
     width, height = fig.get_size_inches()
     outer = fig.add_gridspec(
         1, blocks, left=0.01, right=1 - 0.75 / width, bottom=0.01, top=1 - 0.42 / height, wspace=0.06
@@ -302,7 +304,7 @@ def star_panels(
     for b in range(blocks):
         grid = outer[b].subgridspec(rows, 3, wspace=0.03, hspace=0.06)
         for r, s in enumerate(shown[b * rows : (b + 1) * rows]):
-            data, model, difference = (stamp(frame, column[s], row[s]) for frame in (used, expected, sigma))
+            data, model, difference = (stamp(frame, column[s], row[s]) for frame in (used, expected, residual))
             norm = _stretch(data, model)
             axes = [fig.add_subplot(grid[r, c]) for c in range(3)]
             _show(axes[0], data, norm, "viridis")
@@ -322,6 +324,7 @@ def star_panels(
 def overview(
     counts: Floats,
     expected: Floats,
+    sigma: Floats,
     mask: Mask,
     draws: Floats,
     names: Sequence[str],
@@ -332,7 +335,8 @@ def overview(
 
     Parameters
     ----------
-    counts, expected : ndarray, shape (ny, nx), counts per pixel
+    counts, expected, sigma : ndarray, shape (ny, nx), counts per pixel
+        Frame, model, and the standard deviation that the noise model gives each pixel.
     mask : ndarray of bool, shape (ny, nx)
         True where a pixel enters the likelihood.
     draws : ndarray, shape (n, d), parameter units
@@ -353,7 +357,7 @@ def overview(
     fig = Figure(figsize=(19, sum(heights)), dpi=100, layout="constrained")
     parts: Any = fig.subfigures(2, 1, height_ratios=heights)  # an array, whatever the stubs of the version say
     upper, lower = parts
-    _draw_triptych(fig, upper.subplots(1, 3), counts, expected, mask)
+    _draw_triptych(fig, upper.subplots(1, 3), counts, expected, sigma, mask)
     ax = lower.subplots()
     place = np.arange(len(kept))
     for band in (1.0, 2.0):
@@ -375,7 +379,9 @@ def overview(
     return fig
 
 
-def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, mask: Mask) -> None:
+def _draw_triptych(
+    fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask
+) -> None:
     """Frame, model and residual on three axes; the first two share a colour bar."""
     ny, nx = counts.shape
     extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
@@ -391,7 +397,7 @@ def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: 
     ticks = _even_ticks(norm)
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()
-    residual = _show(axes[2], _residual(counts, expected, mask), _sigma_norm(), "RdBu_r", extent)
+    residual = _show(axes[2], _residual(counts, expected, sigma, mask), _sigma_norm(), "RdBu_r", extent)
     fig.colorbar(residual, cax=axes[2].inset_axes((1.02, 0.0, 0.035, 1.0)), label="residual / sigma")
     for ax, title in zip(axes, ("frame", "model", "residual"), strict=True):
         ax.set(title=title, xlabel="u / pixel")
@@ -416,11 +422,10 @@ def _recorded(counts: Floats, mask: Mask) -> Floats:
     return np.where(mask | (counts != 0.0), counts, np.nan)
 
 
-def _residual(counts: Floats, expected: Floats, mask: Mask) -> Floats:
-    """Residual in standard deviations of a Poisson count; nan outside the mask."""
+def _residual(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> Floats:
+    """Residual in standard deviations; nan outside the mask."""
     out = np.full(counts.shape, np.nan)
-    lit = mask & (expected > 0.0)
-    out[lit] = (counts[lit] - expected[lit]) / np.sqrt(expected[lit])
+    out[mask] = (counts[mask] - expected[mask]) / sigma[mask]
     return out
 
 
