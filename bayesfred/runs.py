@@ -231,7 +231,7 @@ def _posterior(
     run: settings.RunSettings, model: ForwardModel, counts: Floats, mask: npt.NDArray[np.bool_] | None
 ) -> Posterior:
     n = run.nuisances
-    nuisances = Nuisances(n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint)
+    nuisances = Nuisances(n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint, n.position_scatter)
     prior = {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
     return Posterior(model, counts, prior=prior, noise=_noise(run), mask=mask, nuisances=nuisances)
 

@@ -208,6 +208,8 @@ class NuisanceSettings(_Section):
         Order of the background's polynomial over the frame.
     footprint : float, optional, pixel
         Keep only pixels this near to a catalogued source.
+    position_scatter : bool
+        Whether sources lie off their catalogue positions, by errors of unknown standard deviation; with free fluxes.
     """
 
     flux: Literal["fixed", "scale", "free"] = "fixed"
@@ -215,6 +217,7 @@ class NuisanceSettings(_Section):
     psf_sigma: bool = False
     background_order: Literal[0, 1, 2] = 0
     footprint: _Positive | None = None
+    position_scatter: bool = False
 
 
 class PriorSettings(_Section):

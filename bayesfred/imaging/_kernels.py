@@ -191,8 +191,8 @@ def _find_peak(o, s, theta, offset_x, offset_y, a, b):
 
 
 @nb.njit(cache=True)
-def _reach(o, a, b, sigma):
-    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = sigma sqrt(cut); inf: the frame.
+def _reach(o, a, b, radius):
+    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius; inf: the frame.
 
     With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2 of
     |c_mn| |d|^(m + n). On the ellipse |J d| = R' one has |d| <= R'/s, s the smaller singular value of J, hence
@@ -206,7 +206,6 @@ def _reach(o, a, b, sigma):
     root = math.sqrt(max(half * half - det * det, 0.0))
     largest = math.sqrt(half + root)
     smallest = abs(det) / largest if largest > 0.0 else 0.0
-    radius = sigma * math.sqrt(o.cut)
     if not (smallest > 0.0 and radius < math.inf):
         return math.inf
     reach = radius
@@ -226,9 +225,13 @@ def _reach(o, a, b, sigma):
 
 
 @nb.njit(cache=True)
-def locate(o, theta, offset_x, offset_y, sigma, maps):
-    """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak)."""
+def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
+    """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak).
+
+    Windows hold the pixels above the tolerance, and those above it once a source moves by up to `margin` in (a, b).
+    """
     unfolded = True
+    radius = sigma * math.sqrt(o.cut) + margin
     for s in range(o.x.size):
         a = maps.a[s]
         b = maps.b[s]
@@ -236,7 +239,7 @@ def locate(o, theta, offset_x, offset_y, sigma, maps):
         unfolded = unfolded and ok
         maps.peak[s, 0] = u
         maps.peak[s, 1] = v
-        reach = _reach(o, a, b, sigma) if ok else math.inf
+        reach = _reach(o, a, b, radius) if ok else math.inf
         if reach < math.inf:
             alpha = a[1, 0] ** 2 + b[1, 0] ** 2
             maps.ellipse[s, 0] = alpha
@@ -402,7 +405,7 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
     """Add all sources to the padded, flattened image `out`. Returns False where a source's map folds."""
     maps = new_maps(o)
     work = new_work(o)
-    unfolded = locate(o, theta, offset_x, offset_y, sigma, maps)
+    unfolded = locate(o, theta, offset_x, offset_y, sigma, 0.0, maps)
     fp = footprints(o, maps)
     for s in range(o.x.size):
         add_source(o, maps, fp, s, sigma, flux[s], out, work)
@@ -457,6 +460,19 @@ def _absolute_and_sign(absolute, signed, source):
 
 
 @nb.njit(inline="always")
+def _to_shift(along, across, size, signed, inverse):
+    """From the samples of p to those of a p / sigma^2, where `along` holds p_a |D| and `across` p_b |D|."""
+    for i in range(size.size):
+        k = size[i]
+        x = -along[i] / k if k > 0.0 else 0.0
+        y = -across[i] / k if k > 0.0 else 0.0
+        along[i] = k * (inverse - x * x)
+        across[i] = -k * x * y
+        size[i] = k * x
+        signed[i] *= x
+
+
+@nb.njit(inline="always")
 def _add_row_of(out, row):
     for i in range(row.size):
         out[i] += row[i]
@@ -491,12 +507,15 @@ def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start)
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
+def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, powers, work):
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
     An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term changes
     b, hence p by p_b B and D by B_v a_u - B_u a_v. With E = weight p and s = sign(D) the rows of `samples` are E, E |D|, s E,
     p_a |D|, p_b |D|, s E b_v, -s E b_u, -s E a_v, s E a_u.
+
+    Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is shifted along a and along b,
+    X = -p_a |D| and Y = -p_b |D|: the same with p replaced by a p / sigma^2 or b p / sigma^2.
     """
     ra, rb, rav, rbv, rq, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     ramp, conserve = o.ramp, len(o.d_degree) > 0
@@ -505,6 +524,7 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
         out[k, :n] = 0.0
     k = -0.5 * LOG2_E / (sigma * sigma)
     inverse = 1.0 / (sigma * sigma)
+    order = 1.0 if template == 0 else 2.0
     norm = inverse / (2.0 * math.pi)
     v_row = (j - 0.5 * (o.ny - 1)) * o.step
     u_row = (low - 0.5 * (o.nx - 1)) * o.step
@@ -525,6 +545,10 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
             _absolute_and_sign(size, signed, e)
             _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.u_degree)
             _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.u_degree)
+            if template == 1:
+                _to_shift(along_a, along_b, size, signed, inverse)
+            elif template == 2:
+                _to_shift(along_b, along_a, size, signed, inverse)
             if conserve:
                 _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.u_degree)
                 _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.u_degree)
@@ -537,9 +561,10 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
             else:
                 samples[5:] = 0.0
             _add_row_of(row_k, size)
-            rq[0] += LOG2_E  # dK/dsigma = K ((a^2 + b^2) / sigma^2 - 2) / sigma, and a^2 + b^2 = q / k
+            # dK/dsigma = K ((a^2 + b^2) / sigma^2 - 2) / sigma, and a^2 + b^2 = q / k; for X and Y, - 4 in place of - 2
+            rq[0] += order * LOG2_E
             _times_polynomial(e, size, -2.0 / (LOG2_E * sigma), ramp, t, rq, o.q_degree)
-            rq[0] -= LOG2_E
+            rq[0] -= order * LOG2_E
             _add_row_of(row_s, e)
             _powers_row(powers, ramp, u, n)
             _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
@@ -561,7 +586,7 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
             j, low, n = fp.row[p], fp.low[p], fp.size[p]
             if not first <= j < last:
                 continue
-            basis_row(o, maps, basis, s, j, low, n, sigma, rows, samples, powers, work)
+            basis_row(o, maps, basis, s, j, low, n, sigma, 0, rows, samples, powers, work)
             for k in range(basis.row.size):
                 c = flux[s] * basis.lever[s, k]
                 if c != 0.0:
@@ -575,5 +600,5 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
 def jacobian(o, theta, sigma, flux, basis, out):
     """d image / d parameters into out (parameters, ny, padded row)."""
     maps = new_maps(o)
-    locate(o, theta, 0.0, 0.0, sigma, maps)
+    locate(o, theta, 0.0, 0.0, sigma, 0.0, maps)
     add_jacobian_rows(o, maps, footprints(o, maps), basis, flux, sigma, 0, o.ny, out)

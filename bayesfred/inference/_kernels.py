@@ -14,13 +14,28 @@ the iteration climbs from any start, and converges quadratically as d vanishes. 
 
 H couples only sources whose footprints share pixels, so everything is done cluster by cluster of touching footprints.
 
-Gradient of the Laplace term. Per pixel let r = n/mu - 1, W = n/mu^2, T = n/mu^3, and for sources s, t let
-Q = H^-1, q_s = sum_t Q_st K_t, h = sum_s K_s q_s. Because dW = -2 T dmu and the maximising F moves by
-dF = Q d(dL/dF), the chain rule gives for any parameter, with z = Q (sum_p T h K + Q_tt / F_t^3) and y = sum_t z_t K_t,
+Gradient of the Laplace term. Per pixel let r = n/mu - 1, W = n/mu^2, C = n/mu^3, and for sources s, t let
+Q = H^-1, q_s = sum_t Q_st K_t, h = sum_s K_s q_s. Because dW = -2 C dmu and the maximising F moves by
+dF = Q d(dL/dF), the chain rule gives for any parameter, with z = Q (sum_p C h K + Q_tt / F_t^3) and y = sum_t z_t K_t,
 
-    d log L = sum_p A dB + sum_s sum_p c_s dK_s,   A = r + T h - W y,   c_s = F_s A + z_s r - W q_s.
+    d log L = sum_p A dB + sum_s sum_p c_s dK_s,   A = r + C h - W y,   c_s = F_s A + z_s r - W q_s.
 
 The 1/F_t^3 is the prior's share: it adds 1/F_t^2 to H. With fixed fluxes A = r and c_s = F_s r.
+
+Free positions. Where the catalogue's positions scatter, every source has three free numbers phi = (F, dx, dy), the shifts dx
+and dy of a and b having the prior N(0, tau^2), and three templates T = d mu/d phi: K, F X and F Y with X = dK/d dx, Y = dK/d dy,
+made anew as the source moves. H = sum_p W T T^T + diag(1/F^2, 1/tau^2, 1/tau^2) leaves out the second derivatives, which it
+weighs with residuals of mean zero; that makes it positive definite anywhere. What is said above then holds with Q = H^-1,
+q_t = sum_u Q_tu T_u, h = sum_t T_t q_t, y = sum_t z_t T_t, and z = G^-1 e, where G is H with the second derivatives and e is what
+moving phi does to -1/2 log det H:
+
+    e_F = sum_p [C h K - W (q_1 X + q_2 Y)] + Q_00/F^3,    e_dx = sum_p [C h F X - W (q_0 X + q_1 F K_xx + q_2 F K_xy)],
+
+e_dy likewise. Every source gives d log L the terms c_0 dK + c_1 dX + c_2 dY,
+
+    c_0 = F A + z_0 r - W q_0,   c_1 = F (z_1 r - W q_1),   c_2 = F (z_2 r - W q_2),
+
+and d log L/d tau = sum_s [(dx^2 + dy^2 + Q_11 + Q_22 + 2 z_1 dx + 2 z_2 dy)/tau^3 - 2/tau].
 """
 
 import math
@@ -34,6 +49,7 @@ from bayesfred.imaging._kernels import (
     FAST,
     REDUCE,
     SEGMENT,
+    Basis,
     Floats,
     Footprints,
     Ints,
@@ -261,17 +277,52 @@ def _log_likelihood(counts, w, background):
 
 @nb.njit(cache=True)
 def _stamps(o, maps, fp, sigma):
-    """Every source's image at unit flux, row after row."""
-    out = np.zeros(fp.start[fp.row.size])
+    """Every source's image at unit flux, row after row; shape (1, samples)."""
+    out = np.zeros((1, fp.start[fp.row.size]))
     work = new_work(o)
     for s in range(o.x.size):
         a, b, peak = maps.a[s], maps.b[s], maps.peak[s]
         for i in range(fp.first[s], fp.first[s + 1]):
             w = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step - peak[1]
             t = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step - peak[0]
-            row = out[fp.start[i] : fp.start[i + 1]]
+            row = out[0, fp.start[i] : fp.start[i + 1]]
             add_pixels(row, w, t, a, b, o.offsets, o.weights, o.ramp, sigma, 1.0, work, o.u_degree, o.q_degree, o.d_degree)
     return out
+
+
+class Rows(NamedTuple):
+    """Buffers for a row of a basis."""
+
+    out: Floats
+    samples: Floats
+    powers: Floats
+    work: Floats
+
+
+@nb.njit(cache=True)
+def _new_rows(o, basis, width):
+    rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
+    return Rows(rows, np.empty((9, width)), np.empty((len(o.u_degree) + 1, width)), new_work(o))
+
+
+@nb.njit(cache=True)
+def _constants():
+    """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of a template T."""
+    one = np.zeros((1, 2), np.int64)
+    return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
+
+
+@nb.njit(cache=True)
+def _move(o, maps, fp, s, sigma, flux, by_x, by_y, stamps, constants, rows):
+    """Shift source s, and fill its rows of the templates `stamps`, shape (3, samples), with K, F X and F Y."""
+    maps.a[s, 0, 0] -= by_x
+    maps.b[s, 0, 0] -= by_y
+    for p in range(fp.first[s], fp.first[s + 1]):
+        n = fp.size[p]
+        basis_row(o, maps, constants, s, fp.row[p], fp.low[p], n, sigma, 0, rows.out, rows.samples, rows.powers, rows.work)
+        for k in range(n):
+            at = fp.start[p] + k
+            stamps[0, at], stamps[1, at], stamps[2, at] = rows.out[2, k], -flux * rows.out[0, k], -flux * rows.out[1, k]
 
 
 @nb.njit(cache=True)
@@ -288,7 +339,7 @@ def _boxes(fp):
 
 
 @nb.njit(cache=True)
-def _clusters(boxes):
+def _clusters(boxes, templates):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
     parent = np.arange(size)
@@ -325,7 +376,7 @@ def _clusters(boxes):
         first[label[s] + 1] += 1
     start = np.zeros(groups + 1, np.int64)
     for c in range(groups):
-        start[c + 1] = start[c] + first[c + 1] ** 2
+        start[c + 1] = start[c] + (templates * first[c + 1]) ** 2
         first[c + 1] += first[c]
     return Clusters(members, first, start)
 
@@ -340,12 +391,14 @@ def _dot(a, b, weight):
 
 @nb.njit(cache=True)
 def _gram(fp, boxes, members, stamps, weight, pitch, out):
-    """out[s, t] = sum over pixels of weight K_s K_t, both triangles."""
+    """out[i, k] = sum over pixels of weight T_i T_k, both triangles; a source's templates follow each other."""
+    size = stamps.shape[0]
     for i in range(members.size):
         s = members[i]
         for k in range(i + 1):
             t = members[k]
-            total = 0.0
+            block = out[i * size : (i + 1) * size, k * size : (k + 1) * size]
+            block[:] = 0.0
             if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
                 for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
                     p = fp.first[s] + j - boxes[s, 0]
@@ -354,9 +407,11 @@ def _gram(fp, boxes, members, stamps, weight, pitch, out):
                     b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
                     if a < b:
                         ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
-                        total += _dot(stamps[ps + a : ps + b], stamps[qs + a : qs + b], weight[j * pitch + a : j * pitch + b])
-            out[i, k] = total
-            out[k, i] = total
+                        for m in range(size):
+                            left = stamps[m, ps + a : ps + b]
+                            for n in range(size):
+                                block[m, n] += _dot(left, stamps[n, qs + a : qs + b], weight[j * pitch + a : j * pitch + b])
+            out[k * size : (k + 1) * size, i * size : (i + 1) * size] = block.T
 
 
 @nb.njit(cache=True)
@@ -391,12 +446,12 @@ def _solve(lower, x):
 
 
 @nb.njit(cache=True)
-def _draw(fp, s, stamps, amplitude, pitch, out):
-    """Add amplitude times a source's stamp to an image."""
+def _draw(fp, s, template, amplitude, pitch, out):
+    """Add amplitude times one of a source's templates, shape (samples,), to an image."""
     for i in range(fp.first[s], fp.first[s + 1]):
         at = fp.row[i] * pitch + fp.low[i]
         target = out[at : at + fp.size[i]]
-        stamp = stamps[fp.start[i] : fp.start[i + 1]]
+        stamp = template[fp.start[i] : fp.start[i + 1]]
         for k in range(stamp.size):
             target[k] += amplitude * stamp[k]
 
@@ -461,45 +516,63 @@ def _first_flux(counts, w, fp, s, stamps, background):
             n = counts.values[fp.row[i] * pitch + fp.low[i] + k]
             if n > LIMIT:
                 u = (2 * (fp.low[i] + k) - counts.nx + 1) / counts.nx
-                stamp = stamps[fp.start[i] + k]
+                stamp = stamps[0, fp.start[i] + k]
                 above += stamp * (n - (c0 + u * (c1 + u * c2)))
                 below += stamp * stamp
     return above / below if below > 0.0 else 0.0
 
 
-@nb.njit(cache=True, error_model="numpy")
-def _profile(counts, w, fp, boxes, clusters, stamps, background, scale, flux, factors):
-    """Fill `flux` with its maximum and `factors` with the Cholesky factors of H; add the sources to the image.
+@nb.njit(cache=True)
+def _project(fp, s, template, image, pitch):
+    """Sum over a source's pixels of one of its templates times an image."""
+    total = 0.0
+    for p in range(fp.first[s], fp.first[s + 1]):
+        at = fp.row[p] * pitch + fp.low[p]
+        for k in range(fp.size[p]):
+            total += template[fp.start[p] + k] * image[at + k]
+    return total
 
-    Returns the log-prior of the fluxes plus the Laplace term, or -inf without a maximum. The prior of flux s is
-    Gamma(2, scale[s]), with density F exp(-F / scale) / scale^2.
+
+@nb.njit(cache=True, error_model="numpy")
+def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, scale, flux, shift, factors):
+    """Fill `flux` and `shift` with their maximum and `factors` with the Cholesky factors of H; add the sources to the image.
+
+    Returns the log-prior of the fluxes and shifts plus the Laplace term, or -inf without a maximum. The prior of flux s is
+    Gamma(2, scale[s]), with density F exp(-F / scale) / scale^2. With three templates the shifts are free, and `maps` is left
+    with the shifted sources.
     """
     pitch = w.image.size // w.span.shape[0]
     score, weight = w.score, w.weight
+    size = stamps.shape[0]
+    constants = _constants()
+    rows = _new_rows(o, constants, pitch)
     value = 0.0
+    shift[:] = 0.0
     for c in range(clusters.first.size - 1):
         members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
-        n = members.size
+        n = members.size * size
         h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
         step = np.empty(n)
-        for i in range(n):
-            s = members[i]
+        for s in members:
+            if size > 1:
+                _move(o, maps, fp, s, sigma, 1.0, 0.0, 0.0, stamps, constants, rows)
             flux[s] = max(_first_flux(counts, w, fp, s, stamps, background), 0.01 * scale[s])
-            _draw(fp, s, stamps, flux[s], pitch, w.image)
+            stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= flux[s]
+            _draw(fp, s, stamps[0], flux[s], pitch, w.image)
         converged = False
         for _ in range(100):
-            for i in range(n):
-                _weigh_footprint(counts, w, fp, members[i], background, score, weight)
+            for s in members:
+                _weigh_footprint(counts, w, fp, s, background, score, weight)
             _gram(fp, boxes, members, stamps, weight, pitch, h)
             for i in range(n):
-                s = members[i]
-                total = 1.0 / flux[s] - 1.0 / scale[s]
-                for k in range(fp.first[s], fp.first[s + 1]):
-                    at = fp.row[k] * pitch + fp.low[k]
-                    for m in range(fp.size[k]):
-                        total += stamps[fp.start[k] + m] * score[at + m]
-                step[i] = total
-                h[i, i] += 1.0 / flux[s] ** 2
+                s, t = members[i // size], i % size
+                step[i] = _project(fp, s, stamps[t], score, pitch)
+                if t == 0:
+                    step[i] += 1.0 / flux[s] - 1.0 / scale[s]
+                    h[i, i] += 1.0 / flux[s] ** 2
+                else:
+                    step[i] -= shift[s, t - 1] / scatter**2
+                    h[i, i] += 1.0 / scatter**2
             gradient = step.copy()
             if not _cholesky(h):
                 break
@@ -509,60 +582,93 @@ def _profile(counts, w, fp, boxes, clusters, stamps, background, scale, flux, fa
                 break
             largest = 0.0
             for i in range(n):
-                largest = max(largest, abs(step[i]) / flux[members[i]])
-                _blank(fp, members[i], pitch, score)
+                s, t = members[i // size], i % size
+                largest = max(largest, abs(step[i]) / (flux[s] if t == 0 else sigma))
+                if t == 0:
+                    _blank(fp, s, pitch, score)
             for i in range(n):
-                _draw(fp, members[i], stamps, step[i], pitch, score)
-            for i in range(n):
-                largest = max(largest, _largest_change(counts, w, fp, members[i], background, score))
+                _draw(fp, members[i // size], stamps[i % size], step[i], pitch, score)
+            for s in members:
+                largest = max(largest, _largest_change(counts, w, fp, s, background, score))
             length = 1.0 / (1.0 + largest)
-            for i in range(n):
-                s = members[i]
-                flux[s] += length * step[i]
-                _draw(fp, s, stamps, length * step[i], pitch, w.image)
+            for i in range(members.size):
+                s, by = members[i], length * step[i * size : (i + 1) * size]
+                if size > 1:
+                    _draw(fp, s, stamps[0], -flux[s], pitch, w.image)
+                    flux[s] += by[0]
+                    shift[s] += by[1:]
+                    _move(o, maps, fp, s, sigma, flux[s], by[1], by[2], stamps, constants, rows)
+                    _draw(fp, s, stamps[0], flux[s], pitch, w.image)
+                else:
+                    flux[s] += by[0]
+                    _draw(fp, s, stamps[0], by[0], pitch, w.image)
         if not converged:
             return -math.inf
         for i in range(n):
-            s = members[i]
-            value += math.log(flux[s] / scale[s] ** 2) - flux[s] / scale[s]
-            value += 0.5 * math.log(2.0 * math.pi) - math.log(h[i, i])
+            value -= math.log(h[i, i])
+        for s in members:
+            value += math.log(flux[s] / scale[s] ** 2) - flux[s] / scale[s] + 0.5 * math.log(2.0 * math.pi)
+            if size > 1:
+                value -= 0.5 * (shift[s, 0] ** 2 + shift[s, 1] ** 2) / scatter**2 + 2.0 * math.log(scatter)
     return value
 
 
-@nb.njit(cache=True)
-def _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted):
-    """Put all sources into the workspace's image, profiling their fluxes into `fitted` if they are free.
+class Fitted(NamedTuple):
+    """What the profiling knows of the sources; empty arrays where fluxes are fixed."""
 
-    Returns what the profiling adds to the log-likelihood, and what it knows of the sources: their footprints, boxes,
-    clusters, stamps and Cholesky factors (empty where fluxes are fixed).
+    footprints: Footprints
+    boxes: Ints
+    clusters: Clusters
+    stamps: Floats  # (templates, samples)
+    factors: Floats  # Cholesky factors of H, cluster after cluster
+    fluxes: Floats
+    shifts: Floats  # (s, 2) pixel
+
+
+@nb.njit(cache=True)
+def _draw_sources(o, counts, w, maps, nuisances, background, flux, free):
+    """Put all sources into the workspace's image, profiling their fluxes, and positions that scatter, if they are free.
+
+    Returns what the profiling adds to the log-likelihood, and what it knows of the sources.
     """
     fp = footprints(o, maps)
     _mark_sources(fp, w)
     if counts.varies:
         _mark_counted(counts, w)
-    sigma = nuisances[3]
+    sigma, scatter = nuisances[3], nuisances[4]
     extra = 0.0
     boxes = _boxes(fp)
-    clusters = _clusters(boxes[: boxes.shape[0] if free else 0])
-    stamps = _stamps(o, maps, fp, sigma) if free else np.empty(0)
+    templates = 3 if scatter > 0.0 else 1
+    clusters = _clusters(boxes[: boxes.shape[0] if free else 0], templates)
     factors = np.empty(clusters.start[-1])
+    fluxes, shifts = np.empty(flux.size), np.zeros((flux.size, 2))
     if free:
-        extra = _profile(counts, w, fp, boxes, clusters, stamps, background, 0.5 * flux, fitted, factors)
+        stamps = np.empty((3, fp.start[fp.row.size])) if templates == 3 else _stamps(o, maps, fp, sigma)
+        extra = _profile(
+            o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, 0.5 * flux, fluxes, shifts, factors
+        )
     else:
+        stamps = np.empty((1, 0))
         work = new_work(o)
         for s in range(o.x.size):
-            fitted[s] = nuisances[0] * flux[s]
-            add_source(o, maps, fp, s, sigma, fitted[s], w.image, work)
-    return extra, fp, boxes, clusters, stamps, factors
+            fluxes[s] = nuisances[0] * flux[s]
+            add_source(o, maps, fp, s, sigma, fluxes[s], w.image, work)
+    return extra, Fitted(fp, boxes, clusters, stamps, factors, fluxes, shifts)
+
+
+@nb.njit(cache=True)
+def _locate(o, theta, nuisances, maps):
+    """Fill `maps`, with windows that hold every source while it moves within 6 standard deviations."""
+    return locate(o, theta, nuisances[1], nuisances[2], nuisances[3], 6.0 * nuisances[4], maps)
 
 
 @nb.njit(cache=True)
 def _log_likelihood_at(o, counts, w, theta, nuisances, background, flux, free):
-    """Log-likelihood for one set of parameters; nuisances are flux_scale, offset_x, offset_y, psf_sigma."""
+    """Log-likelihood for one set of parameters; nuisances are flux_scale, offset_x, offset_y, psf_sigma, position_scatter."""
     maps = new_maps(o)
-    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
+    if not _locate(o, theta, nuisances, maps):
         return -math.inf
-    value = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, np.empty(flux.size))[0]
+    value = _draw_sources(o, counts, w, maps, nuisances, background, flux, free)[0]
     if value > -math.inf:
         value += _log_likelihood(counts, w, background)
     clear(w)
@@ -582,24 +688,18 @@ class Drawn(NamedTuple):
 
     possible: bool  # False where a map folds, or the fluxes have no maximum
     maps: Maps
-    footprints: Footprints
-    boxes: Ints
-    clusters: Clusters
-    stamps: Floats
-    factors: Floats
-    fluxes: Floats
+    fitted: Fitted
 
 
 @nb.njit(cache=True, nogil=True)
 def draw(o, counts, w, theta, nuisances, background, flux, free):
     """Draw all sources; whoever uses the image clears the workspace."""
     maps = new_maps(o)
-    possible = locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps)
+    possible = _locate(o, theta, nuisances, maps)
     if not possible:
         maps.rows[:] = 0
-    fluxes = np.empty(flux.size)
-    extra, fp, boxes, clusters, stamps, factors = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fluxes)
-    return Drawn(possible and extra > -math.inf, maps, fp, boxes, clusters, stamps, factors, fluxes)
+    extra, fitted = _draw_sources(o, counts, w, maps, nuisances, background, flux, free)
+    return Drawn(possible and extra > -math.inf, maps, fitted)
 
 
 @nb.njit(cache=True)
@@ -625,86 +725,150 @@ def _weigh(counts, w, background, curve):
 
 
 @nb.njit(cache=True)
-def _laplace_adjoint(w, fp, boxes, clusters, stamps, factors, flux, curve):
-    """z, the stamps q_s and the image A of the module's derivation."""
+def _mix(fp, boxes, members, stamps, inverse, out):
+    """The templates q = Q T of a cluster's sources, added to `out`."""
+    size = stamps.shape[0]
+    for i in range(members.size):
+        s = members[i]
+        for m in range(members.size):
+            t = members[m]
+            if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
+                for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+                    p = fp.first[s] + j - boxes[s, 0]
+                    q = fp.first[t] + j - boxes[t, 0]
+                    first, last = max(fp.low[p], fp.low[q]), min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+                    for a in range(size):
+                        for b in range(size):
+                            factor = inverse[i * size + a, m * size + b]
+                            for k in range(first, last):
+                                out[a, fp.start[p] + k - fp.low[p]] += factor * stamps[b, fp.start[q] + k - fp.low[q]]
+
+
+@nb.njit(cache=True)
+def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, g):
+    """What a source's second derivatives K_xx, K_xy, K_yy and X, Y as dK add to its rows of e and G."""
+    fp, stamps, flux = drawn.fitted.footprints, drawn.fitted.stamps, drawn.fitted.fluxes[s]
     pitch = w.image.size // w.span.shape[0]
+    xx, xy, yy = np.empty(pitch), np.empty(pitch), np.empty(pitch)
+    for p in range(fp.first[s], fp.first[s + 1]):
+        j, low, n = fp.row[p], fp.low[p], fp.size[p]
+        basis_row(o, drawn.maps, constants, s, j, low, n, sigma, 1, rows.out, rows.samples, rows.powers, rows.work)
+        xx[:n], xy[:n] = -flux * rows.out[0, :n], -flux * rows.out[1, :n]
+        basis_row(o, drawn.maps, constants, s, j, low, n, sigma, 2, rows.out, rows.samples, rows.powers, rows.work)
+        yy[:n] = -flux * rows.out[1, :n]
+        for k in range(n):
+            at, pixel = fp.start[p] + k, j * pitch + low + k
+            x, y = stamps[1, at] / flux, stamps[2, at] / flux
+            r, weight = w.score[pixel], w.weight[pixel]
+            q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
+            part[0] -= weight * (q1 * x + q2 * y)
+            part[1] -= weight * (q0 * x + q1 * xx[k] + q2 * xy[k])
+            part[2] -= weight * (q0 * y + q1 * xy[k] + q2 * yy[k])
+            g[0, 1] -= r * x
+            g[0, 2] -= r * y
+            g[1, 1] -= r * xx[k]
+            g[1, 2] -= r * xy[k]
+            g[2, 2] -= r * yy[k]
+    g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
+
+
+@nb.njit(cache=True)
+def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
+    """z, the templates q, the image A and the derivative by tau of the module's derivation."""
+    fp, boxes, clusters, stamps, factors, flux, shift = drawn.fitted
+    pitch = w.image.size // w.span.shape[0]
+    size = stamps.shape[0]
     h, y = np.zeros(w.image.size), np.zeros(w.image.size)
-    z = np.empty(flux.size)
-    mixed = np.zeros(stamps.size)
+    z = np.empty((flux.size, size))
+    mixed = np.zeros(stamps.shape)
+    constants = _constants()
+    rows = _new_rows(o, constants, pitch)
+    slope = 0.0
     for c in range(clusters.first.size - 1):
         members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
-        n = members.size
+        n = members.size * size
         lower = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
         inverse = np.eye(n)
         for i in range(n):
             _solve(lower, inverse[i])
-        for i in range(n):
-            s = members[i]
-            for m in range(n):
-                t = members[m]
-                if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
-                    for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-                        p = fp.first[s] + j - boxes[s, 0]
-                        q = fp.first[t] + j - boxes[t, 0]
-                        for k in range(max(fp.low[p], fp.low[q]), min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])):
-                            mixed[fp.start[p] + k - fp.low[p]] += inverse[i, m] * stamps[fp.start[q] + k - fp.low[q]]
+        _mix(fp, boxes, members, stamps, inverse, mixed)
+        for s in members:
             for p in range(fp.first[s], fp.first[s + 1]):
-                for k in range(fp.size[p]):
-                    at = fp.start[p] + k
-                    h[fp.row[p] * pitch + fp.low[p] + k] += stamps[at] * mixed[at]
-        part = np.empty(n)
+                for t in range(size):
+                    for k in range(fp.size[p]):
+                        at = fp.start[p] + k
+                        h[fp.row[p] * pitch + fp.low[p] + k] += stamps[t, at] * mixed[t, at]
+        part = np.zeros(n)
         for i in range(n):
-            s = members[i]
-            total = inverse[i, i] / flux[s] ** 3
+            s, t = members[i // size], i % size
             for p in range(fp.first[s], fp.first[s + 1]):
                 for k in range(fp.size[p]):
                     at = fp.row[p] * pitch + fp.low[p] + k
-                    total += curve[at] * h[at] * stamps[fp.start[p] + k]
-            part[i] = total
+                    part[i] += curve[at] * h[at] * stamps[t, fp.start[p] + k]
+            if t == 0:
+                part[i] += inverse[i, i] / flux[s] ** 3
+        if size > 1:
+            g = np.empty((n, n))
+            _gram(fp, boxes, members, stamps, w.weight, pitch, g)
+            for i in range(n):
+                g[i, i] += 1.0 / flux[members[i // size]] ** 2 if i % size == 0 else 1.0 / scatter**2
+            for i in range(members.size):
+                own = slice(i * size, (i + 1) * size)
+                _second_derivatives(o, w, drawn, members[i], sigma, mixed, constants, rows, part[own], g[own, own])
+            if _cholesky(g):  # it is positive definite at a maximum; elsewhere H has to do
+                lower = g
         _solve(lower, part)
         for i in range(n):
-            z[members[i]] = part[i]
-            _draw(fp, members[i], stamps, part[i], pitch, y)
+            s, t = members[i // size], i % size
+            z[s, t] = part[i]
+            _draw(fp, s, stamps[t], part[i], pitch, y)
+            if t > 0:
+                d = shift[s, t - 1]
+                slope += (d * d + inverse[i, i] + 2.0 * part[i] * d) / scatter**3 - 1.0 / scatter
     for j in range(w.span.shape[0]):
         for p in range(j * pitch + w.span[j, 0] * SEGMENT, j * pitch + (w.span[j, 1] + 1) * SEGMENT):
             if w.flags[p // SEGMENT]:
                 h[p] = w.score[p] + curve[p] * h[p] - w.weight[p] * y[p]
-    return z, mixed, h
+    return z, mixed, h, slope
 
 
 @nb.njit(cache=True, nogil=True)
-def gradient(o, counts, w, drawn, sigma, background, free, basis, out, out_background):
-    """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`."""
-    maps, fp, stamps, fitted = drawn.maps, drawn.footprints, drawn.stamps, drawn.fluxes
+def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_background):
+    """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`.
+
+    Returns the derivative with respect to position_scatter.
+    """
+    maps, fp, fluxes, sigma = drawn.maps, drawn.fitted.footprints, drawn.fitted.fluxes, nuisances[3]
+    size = drawn.fitted.stamps.shape[0]
     curve = np.empty(w.image.size)
     _weigh(counts, w, background, curve)
     image = w.score
-    z, mixed = np.zeros(fitted.size), np.empty(0)
+    z, mixed, slope = np.zeros((fluxes.size, size)), np.empty((size, 0)), 0.0
     if free:
-        z, mixed, image = _laplace_adjoint(w, fp, drawn.boxes, drawn.clusters, stamps, drawn.factors, fitted, curve)
+        z, mixed, image, slope = _laplace_adjoint(o, w, drawn, sigma, nuisances[4], curve)
     _background_gradient(counts, w, background, image, out_background)
     pitch = w.image.size // o.ny
-    work = new_work(o)
-    rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, pitch))
-    samples, powers = np.empty((9, pitch)), np.empty((len(o.u_degree) + 1, pitch))
+    rows = _new_rows(o, basis, pitch)
     ones, c = np.ones(pitch), np.empty(pitch)
-    moments = np.empty(rows.shape[0])
+    moments = np.empty(rows.out.shape[0])
     for s in range(o.x.size):
         moments[:] = 0.0
         for p in range(fp.first[s], fp.first[s + 1]):
             j, low, n = fp.row[p], fp.low[p], fp.size[p]
             at = j * pitch + low
-            for k in range(n):
-                c[k] = fitted[s] * image[at + k]
-            if free:
-                q = fp.start[p]
+            for t in range(size):
                 for k in range(n):
-                    c[k] += z[s] * w.score[at + k] - w.weight[at + k] * mixed[q + k]
-            basis_row(o, maps, basis, s, j, low, n, sigma, rows, samples, powers, work)
-            for k in range(moments.size):
-                moments[k] += _dot(rows[k, :n], c[:n], ones[:n])
+                    c[k] = fluxes[s] * image[at + k] if t == 0 else 0.0
+                if free:
+                    q, amplitude = fp.start[p], 1.0 if t == 0 else fluxes[s]
+                    for k in range(n):
+                        c[k] += amplitude * (z[s, t] * w.score[at + k] - w.weight[at + k] * mixed[t, q + k])
+                basis_row(o, maps, basis, s, j, low, n, sigma, t, rows.out, rows.samples, rows.powers, rows.work)
+                for k in range(moments.size):
+                    moments[k] += _dot(rows.out[k, :n], c[:n], ones[:n])
         for k in range(basis.row.size):
             out[k] += basis.lever[s, k] * moments[basis.row[k]]
+    return slope
 
 
 @nb.njit(cache=True)
@@ -759,19 +923,23 @@ BAND = 16  # rows of the Jacobian held at a time
 
 
 @nb.njit(cache=True, nogil=True)
-def fisher(o, counts, w, drawn, sigma, background, terms, free, basis, out):
+def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
     """Fisher information of source parameters, then the first `terms` background coefficients, fluxes profiled out.
 
     I = sum over pixels of J J^T / mu, band by band of rows; with free fluxes the Schur complement
-    I - C I_FF^-1 C^T, where I_FF carries the prior's 1/F^2.
+    I - C H^-1 C^T over the sources' templates, where H carries the priors' curvature.
+
+    Returns the information about position_scatter: a coordinate measured with variance s^2 scatters by tau^2 + s^2 about
+    the catalogue's, which gives 2 tau^2 / (tau^2 + s^2)^2 = 2 (tau^2 - Q)^2 / tau^6 with Q its variance given the prior.
     """
-    fp, boxes, clusters, stamps, fitted = drawn.footprints, drawn.boxes, drawn.clusters, drawn.stamps, drawn.fluxes
+    fp, boxes, clusters, stamps, factors, fitted, _ = drawn.fitted
+    sigma, scatter, templates = nuisances[3], nuisances[4], stamps.shape[0]
     pixels = _fisher_weight(counts, w, background)
     ny, pitch = o.ny, w.image.size // o.ny
     per_row = w.flags.size // ny
     sources = basis.row.size
     size = sources + terms
-    cross = np.zeros((fitted.size, size))
+    cross = np.zeros((fitted.size * templates, size))
     band = np.empty((size, BAND, pitch))
     for top in range(0, ny, BAND):
         last = min(top + BAND, ny)
@@ -801,27 +969,37 @@ def fisher(o, counts, w, drawn, sigma, background, terms, free, basis, out):
                 for j in range(max(top, boxes[s, 0]), min(last, boxes[s, 1])):
                     i = fp.first[s] + j - boxes[s, 0]
                     a, b = fp.low[i], fp.low[i] + fp.size[i]
-                    stamp, weight = stamps[fp.start[i] : fp.start[i + 1]], w.weight[j * pitch + a : j * pitch + b]
-                    for k in range(size):
-                        cross[s, k] += _dot(band[k, j - top, a:b], stamp, weight)
+                    weight = w.weight[j * pitch + a : j * pitch + b]
+                    for t in range(templates):
+                        stamp = stamps[t, fp.start[i] : fp.start[i + 1]]
+                        for k in range(size):
+                            cross[s * templates + t, k] += _dot(band[k, j - top, a:b], stamp, weight)
     out[sources, sources] += pixels / background[0] if pixels > 0.0 else 0.0
+    known = 0.0
     if free:
         for c in range(clusters.first.size - 1):
             members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
-            n = members.size
-            h = drawn.factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
+            n = members.size * templates
+            h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
             _gram(fp, boxes, members, stamps, w.weight, pitch, h)
             for i in range(n):
-                h[i, i] += 1.0 / fitted[members[i]] ** 2
+                h[i, i] += 1.0 / fitted[members[i // templates]] ** 2 if i % templates == 0 else 1.0 / scatter**2
             _cholesky(h)  # positive definite: the prior's curvature is
             column = np.empty(n)
+            for i in range(n):
+                if i % templates > 0:
+                    column[:] = 0.0
+                    column[i] = 1.0
+                    _solve(h, column)
+                    known += 2.0 * (scatter**2 - column[i]) ** 2 / scatter**6
             for m in range(size):
                 for i in range(n):
-                    column[i] = cross[members[i], m]
+                    column[i] = cross[members[i // templates] * templates + i % templates, m]
                 _solve(h, column)
                 for k in range(m, size):
                     for i in range(n):
-                        out[k, m] -= cross[members[i], k] * column[i]
+                        out[k, m] -= cross[members[i // templates] * templates + i % templates, k] * column[i]
     for k in range(size):
         for m in range(k):
             out[m, k] = out[k, m]
+    return known

@@ -28,7 +28,7 @@ Floats = npt.NDArray[np.float64]
 FluxMode = Literal["fixed", "scale", "free"]
 
 BACKGROUND_TERMS = ("background", "background_u", "background_v", "background_u2", "background_uv", "background_v2")
-SOURCE_NUISANCES = ("flux_scale", "offset_x", "offset_y", "psf_sigma")
+SOURCE_NUISANCES = ("flux_scale", "offset_x", "offset_y", "psf_sigma", "position_scatter")
 
 _pool: ThreadPoolExecutor | None = None
 
@@ -69,11 +69,14 @@ class Nuisances:
     footprint : float or None, pixel
         Only pixels within this distance of a catalogue position enter the likelihood; for frames with sources that
         the catalogue lacks.
+    position_scatter : bool
+        Whether the sources lie off their catalogue positions, by normal errors of unknown standard deviation along each
+        axis: parameter `position_scatter`, pixel, as imaged. Needs free fluxes. Like these, the shifts are not sampled.
 
     Raises
     ------
     InputError
-        If a value is not one of those listed.
+        If a value is not one of those listed, or positions scatter with fluxes that are not free.
 
     Examples
     --------
@@ -86,6 +89,7 @@ class Nuisances:
     psf_sigma: bool = False
     background_order: int = 0
     footprint: float | None = None
+    position_scatter: bool = False
 
     def __post_init__(self) -> None:
         if self.flux not in get_args(FluxMode):
@@ -94,11 +98,15 @@ class Nuisances:
             raise InputError(f"nuisances: background_order: got {self.background_order!r}, expected 0, 1 or 2")
         if self.footprint is not None and not (np.isfinite(self.footprint) and self.footprint > 0):
             raise InputError(f"nuisances: footprint: got {self.footprint}, expected a radius in pixels > 0")
+        if self.position_scatter and self.flux != "free":
+            raise InputError(
+                f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free ones: set flux to free, or leave it out"
+            )
 
     @property
     def source_names(self) -> tuple[str, ...]:
         """The nuisance parameters that act on the sources."""
-        free = (self.flux == "scale", self.offset, self.offset, self.psf_sigma)
+        free = (self.flux == "scale", self.offset, self.offset, self.psf_sigma, self.position_scatter)
         return tuple(name for name, is_free in zip(SOURCE_NUISANCES, free, strict=True) if is_free)
 
     @property
@@ -123,7 +131,8 @@ class Nuisances:
         a = group.attrs
         footprint = float(a["footprint"]) or None
         flux: Any = str(a["flux"])
-        return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), int(a["background_order"]), footprint)
+        order, scatter = int(a["background_order"]), bool(a["position_scatter"])
+        return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), order, footprint, scatter)
 
 
 def _usable(
@@ -329,16 +338,17 @@ class Posterior:
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
         with self._drawn(arguments) as (w, drawn):
-            sigma, level = arguments[1][3], arguments[2]
-            _kernels.gradient(
-                self._optics, self._frame, w, drawn, sigma, level, self._free, self._basis, sources, background
+            slope = _kernels.gradient(
+                self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background
             )
         if isinstance(self.noise, BackgroundNoise):
             level = arguments[2][0]
             residual = self.counts - self.expected_counts(vector)
             squares = float(np.sum(residual[self.mask] ** 2))
             background[0] += 0.5 * (squares / level - self._frame.pixels) / level
-        out = self._gather(sources, background)
+        terms = len(self.nuisances.background_names)
+        scatter = [slope] if self.nuisances.position_scatter else []
+        out = np.concatenate([sources, scatter, background[:terms]])[self._order]
         if self.nuisances.flux == "scale":
             out[self.parameter_names.index("flux_scale")] /= arguments[1][0]
         out += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
@@ -359,8 +369,11 @@ class Posterior:
         size = self._basis.row.size + terms
         out = np.zeros((size, size))
         with self._drawn(arguments) as (w, drawn):
-            sigma, level = arguments[1][3], arguments[2]
-            _kernels.fisher(self._optics, self._frame, w, drawn, sigma, level, terms, self._free, self._basis, out)
+            known = _kernels.fisher(self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free, self._basis, out)
+        if self.nuisances.position_scatter:  # independent of the others: it is known by the shifts' size alone
+            k = self._basis.row.size
+            out = np.insert(np.insert(out, k, 0.0, axis=0), k, 0.0, axis=1)
+            out[k, k] = known
         if isinstance(self.noise, BackgroundNoise):
             k = self._basis.row.size
             out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
@@ -403,13 +416,14 @@ class Posterior:
         u, v = (np.arange(1 - n, n, 2) / n for n in (nx, ny))
         background = np.polynomial.polynomial.polyval2d(*np.meshgrid(u, v), _square(arguments[2]))
         bad = 0.0 if drawn.possible else np.nan
-        return sources + background - self.noise.shift + bad, drawn.fluxes + bad
+        return sources + background - self.noise.shift + bad, drawn.fitted.fluxes + bad
 
     def start(self) -> Floats:
         """Parameters to begin a search from: no distortion, the frame's median as background, nuisances as given."""
         median = float(np.median(self.counts[self.mask]))
         level = median if median > 0 else max(0.1 * float(np.mean(self.counts[self.mask])), 1e-6)
-        known = {"background": level, "flux_scale": 1.0, "psf_sigma": self.model.psf.sigma}
+        sigma = self.model.psf.sigma
+        known = {"background": level, "flux_scale": 1.0, "psf_sigma": sigma, "position_scatter": 0.1 * sigma}
         return np.array([known.get(name, 0.0) for name in self.parameter_names])
 
     def _vectors(self, params: npt.ArrayLike) -> Floats:
@@ -430,10 +444,6 @@ class Posterior:
         background = np.stack([column.get(name, np.zeros(n)) for name in BACKGROUND_TERMS], axis=1)
         background[:, 0] += self.noise.shift
         return np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]), nuisances, background
-
-    def _gather(self, sources: Floats, background: Floats) -> Floats:
-        terms = len(self.nuisances.background_names)
-        return np.concatenate([sources, background[:terms]])[self._order]
 
     @contextmanager
     def _workspace(self) -> Iterator[_kernels.Workspace]:
@@ -470,7 +480,7 @@ class Posterior:
 
     @cached_property
     def _basis(self) -> Basis:
-        return self.model.basis(self.nuisances.source_names)
+        return self.model.basis([name for name in self.nuisances.source_names if name != "position_scatter"])
 
     @property
     def _flux(self) -> Floats:
