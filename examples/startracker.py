@@ -46,18 +46,19 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
     for name, centroid in zip(CUBIC, CENTROIDS, strict=True):
         moved = -draws[:, names.index(name)] * RADIUS**3
         mean, sd = moved.mean(), moved.std(ddof=1)
-        z = (mean - centroid) / np.hypot(sd * ratio, CENTROID_ERROR)
+        z = (mean - centroid) / np.hypot(sd, CENTROID_ERROR)
         worst = max(worst, abs(z))
         print(f"{name:6}  {mean:.3f} +- {sd:.3f}    {centroid:.2f}        {z:+.1f}")
+    tau = draws[:, names.index("position_scatter")]
     print(
-        f"In the mean the frame's centroids lie {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}) pixel from this fit: the residuals\n"
-        f"have no dipole in common. Single stars scatter by {scatter:.3f} pixel, {ratio:.1f} times their errors from photon\n"
-        "noise, which the brightest show as dipoles of either sign. Likely causes: catalogue positions (proper motion\n"
-        "since the catalogue's epoch, close pairs), and a PSF that is no Gaussian in the 1.5 pixels that it covers. The\n"
-        "posterior knows photon noise alone: its errors are too small by about that factor, which the last column allows for."
+        f"The frame's centroids lie {scatter:.3f} pixel (rms along an axis) off this fit, {ratio:.1f} times their errors from photon\n"
+        f"noise, and in the mean {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}). The posterior knows: it finds that the stars scatter by\n"
+        f"{tau.mean():.3f} +- {tau.std(ddof=1):.3f} pixel about their catalogue positions, images each where it is, which leaves no dipoles in the\n"
+        "residuals, and widens the errors of the terms. Likely causes: proper motion since the catalogue's epoch, close pairs,\n"
+        "the air's turbulence during a short exposure, and a PSF that is no Gaussian in the 1.5 pixels that it covers."
     )
     if worst < 3:
-        print("Posterior and centroids agree within 3 such errors.")
+        print("Posterior and centroids agree within 3 errors.")
     else:
         print("Posterior and centroids do not all agree: few of one frame's stars are in the corners that fix x^3 and y^3.")
 

@@ -56,7 +56,7 @@ def test_defaults(tmp_path: Path) -> None:
         "distortion": {"terms": "mirrored"},
         "model": {"conserve_flux": True, "tolerance": 1e-8},
         "noise": {"kind": "poisson", "read_noise": 0.0},
-        "nuisances": {"flux": "fixed", "offset": False, "psf_sigma": False, "background_order": 0},
+        "nuisances": {"flux": "fixed", "offset": False, "psf_sigma": False, "background_order": 0, "position_scatter": False},
         "prior": {},
         "sampling": {"seed": 1, "ensembles": 4, "walkers": 32, "target_ess": 1000},
         "output": {},

@@ -347,6 +347,52 @@ def add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, amplitude, work, 
             _add_row(row, ramp, t + offsets[p], rq, rd, q_degree, d_degree)
 
 
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _add_template_row(image, along, across, ramp, t0, rq, rd, ra, rb, q_degree, d_degree, u_degree):
+    """Like `_add_row`, and `along` and `across` get the same times a and b."""
+    q_top, d_top, top = len(q_degree), len(d_degree), len(u_degree)
+    for i in range(image.size):
+        t = t0 + ramp[i]
+        q = rq[q_top]
+        for m in range(q_top):
+            q = q * t + rq[q_top - 1 - m]
+        d = rd[d_top]
+        for m in range(d_top):
+            d = d * t + rd[d_top - 1 - m]
+        a, b = ra[top], rb[top]
+        for m in range(top):
+            a = a * t + ra[top - 1 - m]
+            b = b * t + rb[top - 1 - m]
+        k = exp2(q) * abs(d)
+        image[i] += k
+        along[i] += k * a
+        across[i] += k * b
+
+
+@nb.njit(cache=True)
+def add_templates(o, maps, fp, s, sigma, flux, stamps, work):
+    """Add K, F X and F Y of source s to stamps[0], stamps[1] and stamps[2]: X = a K/sigma^2 moves it along a, Y along b."""
+    a, b, u, v = maps.a[s], maps.b[s], maps.peak[s, 0], maps.peak[s, 1]
+    ra, rb, rav, rbv, rq, rd = work[0], work[1], work[2], work[3], work[4], work[5]
+    offsets, weights, ramp = o.offsets, o.weights, o.ramp
+    u_degree, q_degree, d_degree = o.u_degree, o.q_degree, o.d_degree
+    inverse = 1.0 / (sigma * sigma)
+    for p in range(fp.first[s], fp.first[s + 1]):
+        first, last = fp.start[p], fp.start[p + 1]
+        row, along, across = stamps[0, first:last], stamps[1, first:last], stamps[2, first:last]
+        w = (fp.row[p] - 0.5 * (o.ny - 1)) * o.step - v
+        t = (fp.low[p] - 0.5 * (o.nx - 1)) * o.step - u
+        for q in range(offsets.size):
+            _row(a, b, w + offsets[q], ra, rb, rav, rbv, u_degree)
+            for k in range(offsets.size):
+                weight = weights[q] * weights[k] * inverse / (2.0 * math.pi)
+                _row_products(ra, rb, rav, rbv, -0.5 * LOG2_E * inverse, weight, rq, rd, u_degree, q_degree, d_degree)
+                _add_template_row(row, along, across, ramp, t + offsets[k], rq, rd, ra, rb, q_degree, d_degree, u_degree)
+        for i in range(row.size):
+            along[i] *= flux * inverse
+            across[i] *= flux * inverse
+
+
 @nb.njit(cache=True)
 def footprints(o, maps):
     """The rows of pixels that every source reaches."""

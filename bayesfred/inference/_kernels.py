@@ -57,6 +57,7 @@ from bayesfred.imaging._kernels import (
     add_jacobian_rows,
     add_pixels,
     add_source,
+    add_templates,
     as_bits,
     as_float,
     basis_row,
@@ -313,16 +314,12 @@ def _constants():
 
 
 @nb.njit(cache=True)
-def _move(o, maps, fp, s, sigma, flux, by_x, by_y, stamps, constants, rows):
-    """Shift source s, and fill its rows of the templates `stamps`, shape (3, samples), with K, F X and F Y."""
+def _move(o, maps, fp, s, sigma, flux, by_x, by_y, stamps, work):
+    """Shift source s, and make its rows of the templates `stamps`, shape (3, samples), anew."""
     maps.a[s, 0, 0] -= by_x
     maps.b[s, 0, 0] -= by_y
-    for p in range(fp.first[s], fp.first[s + 1]):
-        n = fp.size[p]
-        basis_row(o, maps, constants, s, fp.row[p], fp.low[p], n, sigma, 0, rows.out, rows.samples, rows.powers, rows.work)
-        for k in range(n):
-            at = fp.start[p] + k
-            stamps[0, at], stamps[1, at], stamps[2, at] = rows.out[2, k], -flux * rows.out[0, k], -flux * rows.out[1, k]
+    stamps[:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] = 0.0
+    add_templates(o, maps, fp, s, sigma, flux, stamps, work)
 
 
 @nb.njit(cache=True)
@@ -533,6 +530,27 @@ def _project(fp, s, template, image, pitch):
     return total
 
 
+@nb.njit(cache=True)
+def _bend(fp, s, stamps, flux, score, pitch, sigma, g):
+    """Subtract from a source's block of H the second derivatives times the score, as they are for a PSF that no pixel blurs.
+
+    K_xx = X^2/K - K/sigma^2, K_xy = X Y/K: near enough to make the steps that H gives converge several times faster.
+    """
+    for p in range(fp.first[s], fp.first[s + 1]):
+        for k in range(fp.size[p]):
+            at = fp.start[p] + k
+            r = score[fp.row[p] * pitch + fp.low[p] + k]
+            own = stamps[0, at] * flux
+            if own > 1e-200:
+                x, y = stamps[1, at], stamps[2, at]
+                g[0, 1] -= r * x / flux
+                g[0, 2] -= r * y / flux
+                g[1, 1] -= r * (x * x / own - own / (sigma * sigma))
+                g[1, 2] -= r * x * y / own
+                g[2, 2] -= r * (y * y / own - own / (sigma * sigma))
+    g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
+
+
 @nb.njit(cache=True, error_model="numpy")
 def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, scale, flux, shift, factors):
     """Fill `flux` and `shift` with their maximum and `factors` with the Cholesky factors of H; add the sources to the image.
@@ -544,8 +562,7 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
     pitch = w.image.size // w.span.shape[0]
     score, weight = w.score, w.weight
     size = stamps.shape[0]
-    constants = _constants()
-    rows = _new_rows(o, constants, pitch)
+    work = new_work(o)
     value = 0.0
     shift[:] = 0.0
     for c in range(clusters.first.size - 1):
@@ -555,7 +572,7 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
         step = np.empty(n)
         for s in members:
             if size > 1:
-                _move(o, maps, fp, s, sigma, 1.0, 0.0, 0.0, stamps, constants, rows)
+                _move(o, maps, fp, s, sigma, 1.0, 0.0, 0.0, stamps, work)
             flux[s] = max(_first_flux(counts, w, fp, s, stamps, background), 0.01 * scale[s])
             stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= flux[s]
             _draw(fp, s, stamps[0], flux[s], pitch, w.image)
@@ -574,9 +591,16 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
                     step[i] -= shift[s, t - 1] / scatter**2
                     h[i, i] += 1.0 / scatter**2
             gradient = step.copy()
-            if not _cholesky(h):
-                break
-            _solve(h, step)
+            lower = h.copy()
+            if size > 1:
+                for i in range(members.size):
+                    own = slice(i * size, (i + 1) * size)
+                    _bend(fp, members[i], stamps, flux[members[i]], score, pitch, sigma, lower[own, own])
+            if not _cholesky(lower):  # far from the maximum
+                lower[:] = h
+                if not _cholesky(lower):
+                    break
+            _solve(lower, step)
             if np.dot(gradient, step) <= 1e-18:  # the square of the distance in standard deviations
                 converged = True
                 break
@@ -597,12 +621,12 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
                     _draw(fp, s, stamps[0], -flux[s], pitch, w.image)
                     flux[s] += by[0]
                     shift[s] += by[1:]
-                    _move(o, maps, fp, s, sigma, flux[s], by[1], by[2], stamps, constants, rows)
+                    _move(o, maps, fp, s, sigma, flux[s], by[1], by[2], stamps, work)
                     _draw(fp, s, stamps[0], flux[s], pitch, w.image)
                 else:
                     flux[s] += by[0]
                     _draw(fp, s, stamps[0], by[0], pitch, w.image)
-        if not converged:
+        if not (converged and _cholesky(h)):
             return -math.inf
         for i in range(n):
             value -= math.log(h[i, i])
@@ -658,8 +682,8 @@ def _draw_sources(o, counts, w, maps, nuisances, background, flux, free):
 
 @nb.njit(cache=True)
 def _locate(o, theta, nuisances, maps):
-    """Fill `maps`, with windows that hold every source while it moves within 6 standard deviations."""
-    return locate(o, theta, nuisances[1], nuisances[2], nuisances[3], 6.0 * nuisances[4], maps)
+    """Fill `maps`, with windows that hold every source while it moves within 6 standard deviations; False if impossible."""
+    return nuisances[4] >= 0.0 and locate(o, theta, nuisances[1], nuisances[2], nuisances[3], 6.0 * nuisances[4], maps)
 
 
 @nb.njit(cache=True)

@@ -149,7 +149,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
         options={"gtol": 1e-7, "maxiter": 300, "initial_trust_radius": 100.0, "max_trust_radius": 1e6},
     )
     params = place(result.x)
-    covariance = _inverse(posterior.information(params))
+    covariance = inverse(posterior.information(params))
     gradient = posterior.gradient(params)
     distance = float(np.sqrt(np.maximum(gradient @ covariance @ gradient, 0.0)))
     converged = distance < CLOSENESS
@@ -159,7 +159,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     return MapEstimate(params, covariance, -float(result.fun), converged, n_evaluations, message)
 
 
-def _inverse(matrix: Floats) -> Floats:
+def inverse(matrix: Floats) -> Floats:
     """Inverse of a symmetric positive definite matrix whose rows differ in scale."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     inverse = linalg.inv(matrix * np.outer(scale, scale))

@@ -11,12 +11,18 @@ import numpy as np
 import numpy.typing as npt
 from emcee.moves import RedBlueMove
 from scipy.linalg import cholesky, solve_triangular
-from scipy.special import gammaln
+from scipy.special import gammaln, logsumexp
+
+from bayesfred.inference.estimate import MapEstimate, inverse
+from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
 
 HEAVY_SHARE = 0.1
 DEGREES_OF_FREEDOM = 5.0
+
+NESTED = 30  # at most so many approximations to either side
+NEGLIGIBLE = 7.0  # in log weight below the largest: e^-7 = 1e-3
 
 
 class LaplaceMove(RedBlueMove):  # type: ignore[misc]
@@ -31,12 +37,16 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     a move is rejected; a Student distribution alone, at 10 degrees of freedom in 13 dimensions, would have a quarter of
     them rejected. The share w keeps the ratio bounded where the posterior's tails are heavier than a Gaussian's.
 
+    Several approximations make q a mixture of such densities: see `of`.
+
     Parameters
     ----------
-    mean : ndarray, shape (d,)
-        m, the posterior's maximum.
-    covariance : ndarray, shape (d, d)
+    mean : ndarray, shape (d,) or (k, d)
+        m, the posterior's maximum; of k approximations.
+    covariance : ndarray, shape (d, d) or (k, d, d)
         C, the Laplace approximation's covariance.
+    weights : array_like, shape (k,), optional
+        Shares of the approximations; they sum to 1.
 
     References
     ----------
@@ -51,26 +61,70 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     ((3, 1), (3,))
     """
 
-    def __init__(self, mean: Floats, covariance: Floats) -> None:
+    def __init__(self, mean: Floats, covariance: Floats, weights: npt.ArrayLike = (1.0,)) -> None:
         super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
-        self.mean = mean
-        self.lower = cholesky(covariance, lower=True)
+        self.means = np.atleast_2d(mean)
+        d = self.means.shape[1]
+        self.lowers = np.array([cholesky(c, lower=True) for c in np.reshape(covariance, (-1, d, d))])
+        self.weights = np.asarray(weights, dtype=np.float64)
+
+    @classmethod
+    def of(cls, posterior: Posterior, estimate: MapEstimate) -> "LaplaceMove":
+        """The move for a posterior, given its maximum.
+
+        The scatter tau of the sources' positions sets the errors of all that is measured from positions, so that one Gaussian
+        for all its values is a poor approximation. It is nested then: for values tau_k in a geometric series, half an error
+        apart and reaching to either side as far as there is weight (the mean lies above the maximum, as for any scatter
+        about a fit), the other parameters have their Laplace approximation given tau_k, one Newton step from the estimate. The
+        k-th weight is proportional to the posterior there times the root of the determinant of the covariance, that of tau
+        being the squared distance between the tau_k.
+
+        References
+        ----------
+        H. Rue, S. Martino & N. Chopin (2009), JRSS B 71, 319, Section 3.
+        """
+        if not posterior.nuisances.position_scatter:
+            return cls(estimate.params, estimate.covariance)
+        j = posterior.parameter_names.index("position_scatter")
+        rest = np.arange(estimate.params.size) != j
+        ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
+        means, covariances = [], []
+        logs: list[float] = []
+        for outward in (range(NESTED), range(-1, -NESTED, -1)):
+            for k in outward:
+                mean, covariance = estimate.params.copy(), np.zeros(estimate.covariance.shape)
+                mean[j] *= np.exp(k * ratio)
+                covariance[np.ix_(rest, rest)] = inverse(posterior.information(mean)[np.ix_(rest, rest)])
+                mean += covariance @ posterior.gradient(mean)
+                covariance[j, j] = (ratio * mean[j]) ** 2
+                log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(covariance)[1]
+                if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
+                    break
+                means.append(mean)
+                covariances.append(covariance)
+                logs.append(log)
+        return cls(np.array(means), np.array(covariances), np.exp(np.array(logs) - logsumexp(logs)))
 
     def draw(self, n: int, random: np.random.RandomState) -> Floats:
         """n draws from the proposal, shape (n, d)."""
-        z = random.standard_normal((n, self.mean.size))
+        k = random.choice(len(self.weights), n, p=self.weights)
+        z = random.standard_normal((n, self.means.shape[1]))
         stretch = np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, n))
         heavy = random.random_sample(n) < HEAVY_SHARE
-        return np.asarray(self.mean + (z * np.where(heavy, stretch, 1.0)[:, None]) @ self.lower.T)
+        z *= np.where(heavy, stretch, 1.0)[:, None]
+        return np.asarray(self.means[k] + np.einsum("nij,nj->ni", self.lowers[k], z))
 
     def log_density(self, x: Floats) -> Floats:
-        """log q at x, shape (n, d), up to the constant that q(m) depends on through C alone."""
-        z = solve_triangular(self.lower, (x - self.mean).T, lower=True)
-        squared, d, nu = (z**2).sum(axis=0), self.mean.size, DEGREES_OF_FREEDOM
-        normal = np.log1p(-HEAVY_SHARE) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
+        """log q at x, shape (n, d)."""
+        d, nu = x.shape[1], DEGREES_OF_FREEDOM
         peak = gammaln(0.5 * (nu + d)) - gammaln(0.5 * nu) - 0.5 * d * np.log(nu * np.pi)
-        student = np.log(HEAVY_SHARE) + peak - 0.5 * (nu + d) * np.log1p(squared / nu)
-        return np.asarray(np.logaddexp(normal, student))
+        parts = []
+        for mean, lower, weight in zip(self.means, self.lowers, self.weights, strict=True):
+            squared = (solve_triangular(lower, (x - mean).T, lower=True) ** 2).sum(axis=0)
+            normal = np.log1p(-HEAVY_SHARE) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
+            student = np.log(HEAVY_SHARE) + peak - 0.5 * (nu + d) * np.log1p(squared / nu)
+            parts.append(np.logaddexp(normal, student) + np.log(weight) - np.log(np.diag(lower)).sum())
+        return np.asarray(logsumexp(parts, axis=0))
 
     def get_proposal(self, s: Floats, c: Sequence[Floats], random: np.random.RandomState) -> tuple[Floats, Floats]:
         """New positions for the walkers at s, and log q(s) - log q(new); the other walkers c are not used."""

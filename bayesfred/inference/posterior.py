@@ -100,7 +100,7 @@ class Nuisances:
             raise InputError(f"nuisances: footprint: got {self.footprint}, expected a radius in pixels > 0")
         if self.position_scatter and self.flux != "free":
             raise InputError(
-                f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free ones: set flux to free, or leave it out"
+                f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free ones: set flux to free"
             )
 
     @property

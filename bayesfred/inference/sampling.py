@@ -186,7 +186,7 @@ class _Run:
     @classmethod
     def begun(cls, posterior: Posterior, estimate: MapEstimate, path: Path, seed: int, ensembles: int, walkers: int) -> "_Run":
         """Walkers at draws of the Laplace approximation that the prior admits."""
-        move = LaplaceMove(estimate.params, estimate.covariance)
+        move = LaplaceMove.of(posterior, estimate)
         states = []
         for child in np.random.SeedSequence(seed).spawn(ensembles):
             random = np.random.RandomState(np.random.MT19937(child))
@@ -248,7 +248,7 @@ class _Run:
     def _advance(self, total: int) -> Iterator[None]:
         """Step all ensembles in turn; a step counts when every ensemble has made it."""
         moves = [
-            (LaplaceMove(self.estimate.params, self.estimate.covariance), 1.0 - DE_SHARE),
+            (LaplaceMove.of(self.posterior, self.estimate), 1.0 - DE_SHARE),
             (emcee.moves.DEMove(live_dangerously=True), DE_SHARE),
         ]
         last = self.steps[-1] if self.steps else self.start
