@@ -51,11 +51,12 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
         print(f"{name:6}  {mean:.3f} +- {sd:.3f}    {centroid:.2f}        {z:+.1f}")
     tau = draws[:, names.index("position_scatter")]
     print(
-        f"The frame's centroids lie {scatter:.3f} pixel (rms along an axis) off this fit, {ratio:.1f} times their errors from photon\n"
-        f"noise, and in the mean {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}). The posterior knows: it finds that the stars scatter by\n"
-        f"{tau.mean():.3f} +- {tau.std(ddof=1):.3f} pixel about their catalogue positions, images each where it is, which leaves no dipoles in the\n"
-        "residuals, and widens the errors of the terms. Likely causes: proper motion since the catalogue's epoch, close pairs,\n"
-        "the air's turbulence during a short exposure, and a PSF that is no Gaussian in the 1.5 pixels that it covers."
+        f"The frame's centroids lie {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}) pixel off this fit in the mean; singly,\n"
+        f"{scatter:.3f} (rms along an axis), which is {ratio:.1f} times their errors from photon noise. The posterior knows. It\n"
+        f"finds that the stars scatter by {tau.mean():.3f} +- {tau.std(ddof=1):.3f} pixel about the catalogue, draws each where\n"
+        "it is, so that no star is left with a dipole, and widens the errors of the terms. Likely causes: proper motion\n"
+        "since the catalogue's epoch, close pairs, the air's turbulence during a short exposure, and a PSF that is no\n"
+        "Gaussian in the 1.5 pixels that it covers."
     )
     if worst < 3:
         print("Posterior and centroids agree within 3 errors.")

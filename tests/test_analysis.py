@@ -14,6 +14,7 @@ from scipy.stats import poisson
 from bayesfred.analysis.diagnostics import autocorrelation_time, deviance_moments, diagnose
 from bayesfred.inference.convergence import convergence, effective_size, rank_rhat
 from bayesfred.inference.noise import BackgroundNoise
+from bayesfred.inference.posterior import Nuisances
 
 Floats = NDArray[np.float64]
 
@@ -183,7 +184,7 @@ def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None 
         parameter_names=("flux_scale", "background"),
         n_parameters=2,
         noise=noise,
-        nuisances=SimpleNamespace(background_order=0, flux="scale"),
+        nuisances=Nuisances("scale"),
         model=SimpleNamespace(sources=SimpleNamespace(flux=np.ones(1))),
         expected_counts=lambda params: params[0] * spot + params[1],
     )
@@ -300,12 +301,18 @@ def test_wrong_model_is_seen_and_masked_pixels_are_not() -> None:
     assert good.n_pixels == 35 * 40 and good.n_fitted == 2
 
 
-def test_free_fluxes_count_as_fitted_and_a_varying_background_has_no_paper_statistic() -> None:
+@pytest.mark.parametrize(("scatter", "fitted"), [(False, 9), (True, 23)])
+def test_what_is_free_of_a_source_counts_as_fitted(scatter: bool, fitted: int) -> None:
     posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
-    posterior.nuisances = SimpleNamespace(background_order=1, flux="free")
+    posterior.nuisances = Nuisances("free", position_scatter=scatter)
     posterior.model.sources.flux = np.ones(7)
+    assert diagnose(chain_at(np.array([1.0, 5.0]), posterior)).n_fitted == fitted
+
+
+def test_a_varying_background_has_no_paper_statistic() -> None:
+    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior.nuisances = Nuisances(background_order=1)
     result = diagnose(chain_at(np.array([1.0, 5.0]), posterior))
-    assert result.n_fitted == 9
     assert np.isnan(result.background_estimate) and np.isnan(result.chi2_paper)
 
 

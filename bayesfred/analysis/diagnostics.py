@@ -76,7 +76,7 @@ class Diagnostics:
     n_pixels : int
         Pixels that enter the likelihood.
     n_fitted : int
-        Fitted numbers: parameters, and sources where each one's flux is free.
+        Fitted numbers: parameters, and every source's flux and position where these are free.
     background_estimate : float
         The paper's lambda-hat, counts per pixel: mean of counts less the source image. nan unless the
         background is a constant.
@@ -268,13 +268,13 @@ def _fit(posterior: Posterior, params: NDArray[np.float64]) -> dict[str, Any]:
     background = float(params[posterior.parameter_names.index("background")]) if constant else math.nan
     residual = n - (mu - background)
     estimate = float(np.mean(residual))
-    n_sources = posterior.model.sources.flux.size if posterior.nuisances.flux == "free" else 0
+    profiled = posterior.nuisances.profiled * posterior.model.sources.flux.size
     fit: dict[str, Any] = {
         "n_pixels": n.size,
-        "n_fitted": posterior.n_parameters + n_sources,
+        "n_fitted": posterior.n_parameters + profiled,
         "background_estimate": estimate,
         "chi2_paper": float(np.mean((residual - estimate) ** 2) / estimate) if estimate > 0.0 else math.nan,
-        "pearson_expected": float(n.size - posterior.n_parameters - n_sources),
+        "pearson_expected": float(n.size - posterior.n_parameters - profiled),
         "pearson_sd": math.sqrt(2.0 * n.size),
     }
     if isinstance(posterior.noise, BackgroundNoise):

@@ -115,6 +115,11 @@ class Nuisances:
         return BACKGROUND_TERMS[: (1, 3, 6)[self.background_order]]
 
     @property
+    def profiled(self) -> int:
+        """Numbers of every source that are not sampled: flux, and shift along u and v."""
+        return 3 if self.position_scatter else int(self.flux == "free")
+
+    @property
     def names(self) -> tuple[str, ...]:
         """All nuisance parameters but the constant background."""
         return (*self.source_names, *self.background_names[1:])
