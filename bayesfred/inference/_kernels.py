@@ -711,6 +711,7 @@ class Drawn(NamedTuple):
     """The sources as they are drawn in a workspace's image, and what the derivatives need of them."""
 
     possible: bool  # False where a map folds, or the fluxes have no maximum
+    likely: bool  # whether the likelihood is not zero
     maps: Maps
     fitted: Fitted
 
@@ -723,7 +724,8 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
     if not possible:
         maps.rows[:] = 0
     extra, fitted = _draw_sources(o, counts, w, maps, nuisances, background, flux, free)
-    return Drawn(possible and extra > -math.inf, maps, fitted)
+    possible = possible and extra > -math.inf
+    return Drawn(possible, possible and _log_likelihood(counts, w, background) > -math.inf, maps, fitted)
 
 
 @nb.njit(cache=True)

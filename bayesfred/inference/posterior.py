@@ -338,11 +338,13 @@ class Posterior:
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
         vector = self._vectors(params)[0]
-        if not np.isfinite(self.log_prob(vector)):
+        if not np.isfinite(self.log_prior(vector)[0]):
             return np.full(vector.size, np.nan)
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
         with self._drawn(arguments) as (w, drawn):
+            if not drawn.likely:
+                return np.full(vector.size, np.nan)
             slope = _kernels.gradient(
                 self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background
             )
@@ -367,13 +369,15 @@ class Posterior:
         ndarray, shape (d, d); NaN outside the prior's support
         """
         vector = self._vectors(params)[0]
-        if not np.isfinite(self.log_prob(vector)):
+        if not np.isfinite(self.log_prior(vector)[0]):
             return np.full((vector.size, vector.size), np.nan)
         arguments = [a[0] for a in self._arguments(vector[None])]
         terms = len(self.nuisances.background_names)
         size = self._basis.row.size + terms
         out = np.zeros((size, size))
         with self._drawn(arguments) as (w, drawn):
+            if not drawn.likely:
+                return np.full((vector.size, vector.size), np.nan)
             known = _kernels.fisher(self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free, self._basis, out)
         if self.nuisances.position_scatter:  # independent of the others: it is known by the shifts' size alone
             k = self._basis.row.size
