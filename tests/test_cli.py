@@ -585,7 +585,7 @@ def test_ctrl_c_saves_the_steps(interrupted: tuple[Path, int, list[str]]) -> Non
 
 def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ensembles take turns, two calls a step; the 30th call, the first four being the walkers' places, is in the fourth step."""
-    log_prob = Posterior.log_prob
+    log_prob = Posterior.unchecked_log_prob
     calls = 0
 
     def stop(posterior: Posterior, params: NDArray[np.float64]) -> object:
@@ -595,7 +595,7 @@ def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.
             raise KeyboardInterrupt
         return log_prob(posterior, params)
 
-    monkeypatch.setattr(Posterior, "log_prob", stop)
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", stop)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 130
     assert open_chain(folder / "run.h5").chain.shape[1] == 3
@@ -607,7 +607,7 @@ def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bayesfred.runs.find_map", stop)
+    monkeypatch.setattr("bayesfred.inference.sampling.find_map", stop)
     before = snapshot(folder)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 130

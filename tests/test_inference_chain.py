@@ -20,6 +20,7 @@ from test_inference import EVERYTHING, make_model, make_posterior, make_truth
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.scene import SourceCatalog
+from bayesfred.inference import examine
 from bayesfred.inference.chainfile import Chain, fingerprint, open_chain
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise
@@ -76,6 +77,12 @@ def assert_same_file(a: Path, b: Path) -> None:
     first, second = content(a), content(b)
     assert first.keys() == second.keys()
     assert [key for key in first if first[key] != second[key] and first[key] == first[key]] == []
+
+
+def reseal(path: Path) -> None:
+    """Give a file that was edited the seal that its content asks for, as anybody can."""
+    content = path.read_bytes().rsplit(b"\nbayesfred sha256", 1)[0]
+    path.write_bytes(content + examine.seal(content))
 
 
 # --- runs -------------------------------------------------------------------------------------------------
@@ -279,7 +286,7 @@ def test_an_interrupted_run_keeps_its_complete_steps(
     posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
     # 2 calls place the walkers, emcee evaluates none again, and a step is 2 calls an ensemble
-    path, real, left = tmp_path / "chain.h5", Posterior.log_prob, calls
+    path, real, left = tmp_path / "chain.h5", Posterior.unchecked_log_prob, calls
 
     def interrupted(self: Posterior, params: Any) -> Any:
         nonlocal left
@@ -289,7 +296,7 @@ def test_an_interrupted_run_keeps_its_complete_steps(
         return real(self, params)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Posterior, "log_prob", interrupted)
+        patch.setattr(Posterior, "unchecked_log_prob", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(posterior, whole.estimate, path)
     complete = (calls - 2) // 4
@@ -330,12 +337,16 @@ def test_missing_and_foreign_files_are_refused(whole: Chain, tmp_path: Path) -> 
             open_chain(absent)
     with h5py.File(path, "w") as file:
         file["image"] = np.zeros(3)
+    with pytest.raises(InputError, match="got no seal at the end"):
+        open_chain(path)
+    reseal(path)
     with pytest.raises(InputError, match="got None of schema None"):
         open_chain(path)
     for spoil in ("schema", "kind"):
         shutil.copy(whole.path, path)
         with h5py.File(path, "a") as file:
             file.attrs[spoil] = 99
+        reseal(path)
         with pytest.raises(InputError, match="expected 'bayesfred chain' of schema"):
             open_chain(path)
 
@@ -346,6 +357,7 @@ def test_incomplete_files_are_refused(whole: Chain, tmp_path: Path, part: str) -
     shutil.copy(whole.path, path)
     with h5py.File(path, "a") as file:
         del file[part]
+    reseal(path)
     with pytest.raises(InputError, match=r"chain\.h5: "):
         open_chain(path)
 

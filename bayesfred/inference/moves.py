@@ -10,8 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 from emcee.moves import RedBlueMove
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.special import gammaln
+
+from bayesfred.errors import InputError
 
 Floats = npt.NDArray[np.float64]
 
@@ -38,6 +40,11 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     covariance : ndarray, shape (d, d)
         C, the Laplace approximation's covariance.
 
+    Raises
+    ------
+    InputError
+        If the covariance is not a positive definite matrix of finite numbers.
+
     References
     ----------
     L. Tierney (1994), Annals of Statistics 22, 1701, Section 2.3.4 (independence chains). T. Hesterberg (1995),
@@ -54,7 +61,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     def __init__(self, mean: Floats, covariance: Floats) -> None:
         super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
         self.mean = mean
-        self.lower = cholesky(covariance, lower=True)
+        try:
+            self.lower = cholesky(covariance, lower=True)
+        except (LinAlgError, ValueError):
+            raise InputError("estimate: got no positive definite covariance, expected the maximum's: see find_map") from None
 
     def draw(self, n: int, random: np.random.RandomState) -> Floats:
         """n draws from the proposal, shape (n, d)."""
