@@ -1,7 +1,6 @@
 """Runs and their files: resuming, interrupts, damage, and what others can read of them."""
 
 import math
-import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -124,6 +123,25 @@ def test_emcee_reads_the_file(whole: Chain) -> None:
         np.random.RandomState().set_state(backend.random_state)
 
 
+def test_resuming_anywhere_changes_no_bit(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
+    """10 stops at random, on 1 and 2 threads, against one run that never stopped."""
+    total, before = 60, nb.get_num_threads()
+    whole = run(posterior, estimate, tmp_path / "whole.h5", total)
+    stops = np.random.default_rng(52).choice(total - 1, 10, replace=False) + 1
+    try:
+        for threads in range(1, min(2, nb.config.NUMBA_NUM_THREADS) + 1):
+            nb.set_num_threads(threads)
+            for stop in stops:
+                path = tmp_path / f"{threads}-{stop}.h5"
+                run(posterior, estimate, path, int(stop))
+                chain = run(posterior, None, path, total, resume=True)
+                for name in ("chain", "log_prob", "accepted"):
+                    assert np.array_equal(getattr(chain, name), getattr(whole, name)), (threads, stop, name)
+                assert_same_file(path, whole.path)
+    finally:
+        nb.set_num_threads(before)
+
+
 @pytest.mark.parametrize("stops", [(1,), (5,), (11,), (2, 7)])
 def test_a_resumed_run_is_the_uninterrupted_one(
     posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path, stops: tuple[int, ...]
@@ -134,6 +152,17 @@ def test_a_resumed_run_is_the_uninterrupted_one(
         assert chain.chain.shape[1] == stop
     assert draws_of(chain) == draws_of(whole)
     assert_same_file(path, whole.path)
+
+
+def test_another_state_of_the_random_numbers_is_seen(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
+    """What tests of resuming rest on: it is not enough that the positions are right."""
+    path = tmp_path / "chain.h5"
+    run(posterior, whole.estimate, path, 5)
+    with h5py.File(path, "a") as file:
+        file["ensemble_1"].attrs["random_state_2"] = (file["ensemble_1"].attrs["random_state_2"] + 2) % 624
+    reseal(path)
+    resumed = run(posterior, None, path, resume=True)
+    assert np.array_equal(resumed.chain[0], whole.chain[0]) and not np.array_equal(resumed.chain[1], whole.chain[1])
 
 
 def test_a_resumed_run_needs_neither_estimate_nor_the_same_settings(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
@@ -243,42 +272,7 @@ def test_an_estimate_off_the_posterior_is_refused(posterior: Posterior, estimate
         run(posterior, far, tmp_path / "chain.h5")
 
 
-# --- accidents --------------------------------------------------------------------------------------------
-
-
-class AccidentError(Exception):
-    """What the tests below make happen."""
-
-
-@pytest.mark.parametrize("where", ["open", "dataset", "attribute", "fsync", "rename"])
-def test_a_failed_write_leaves_the_old_file(
-    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
-) -> None:
-    path = tmp_path / "chain.h5"
-    shutil.copy(whole.path, path)
-    owner, name, after = {
-        "open": (h5py.File, "__init__", 0),
-        "dataset": (h5py.Group, "create_dataset", 6),
-        "attribute": (h5py.AttributeManager, "__setitem__", 60),
-        "fsync": (os, "fsync", 0),
-        "rename": (os, "replace", 0),
-    }[where]
-    real, calls = getattr(owner, name), 0
-
-    def fail(*args: Any, **kwargs: Any) -> Any:
-        nonlocal calls
-        calls += any(tmp_path.glob(".*.tmp")) or str(args[1:2]).count(".tmp")
-        if calls > after:
-            raise AccidentError
-        return real(*args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, name, fail)
-        with pytest.raises(AccidentError):
-            run(posterior, whole.estimate, path, TOTAL + 1, resume=True)
-    assert path.read_bytes() == whole.path.read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir() if "lock" not in p.name) == ["chain.h5"]
-    assert run(posterior, whole.estimate, path, TOTAL + 1, resume=True).chain.shape[1] == TOTAL + 1
+# --- accidents, of which test_inference_accidents.py has more ------------------------------------------------
 
 
 @pytest.mark.parametrize("calls", [3, 6, 7, 20, 37])
@@ -347,7 +341,7 @@ def test_missing_and_foreign_files_are_refused(whole: Chain, tmp_path: Path) -> 
         with h5py.File(path, "a") as file:
             file.attrs[spoil] = 99
         reseal(path)
-        with pytest.raises(InputError, match="expected 'bayesfred chain' of schema"):
+        with pytest.raises(InputError, match="expected bayesfred chain of schema"):
             open_chain(path)
 
 

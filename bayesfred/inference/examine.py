@@ -99,7 +99,7 @@ def _check_seal(stream: BinaryIO) -> int:
 def _check_schema(kind: Any, schema: Any) -> None:
     if kind == KIND and schema == SCHEMA:
         return
-    later = kind == KIND and schema > SCHEMA
+    later = bool(kind == KIND and schema > SCHEMA)
     mend = "read it with the version that wrote it" if later else "remake it with this version"
     got = f"{kind.decode(errors='replace') if isinstance(kind, bytes) else kind!r} of {'newer ' * later}schema {schema}"
     raise InputError(f"got {got}, expected {KIND.decode()} of schema {SCHEMA}: {mend}")
