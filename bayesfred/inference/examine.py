@@ -74,7 +74,7 @@ def examined(path: Path) -> Iterator[h5py.File]:
                 yield file
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (ArithmeticError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: damaged ({reason}), expected a whole chain file: {MEND}") from None
 
