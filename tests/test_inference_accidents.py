@@ -120,7 +120,7 @@ class Stream:
         return int(self.real.fileno())
 
 
-OPERATIONS = ["create", "write", "write", "flush", "fsync", "replace", "open", "fsync"]
+OPERATIONS = ["unlink", "create", "write", "write", "flush", "fsync", "replace", "open", "fsync"]
 
 
 def test_a_checkpoint_reaches_the_disk_before_it_replaces_the_file(
@@ -161,13 +161,14 @@ def test_a_checkpoint_that_is_not_atomic_fails_that_test(
     posterior: Posterior, old: Chain, new: Chain, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def in_place(target: Path, content: memoryview) -> None:
-        with chainfile.open(target, "wb") as stream:  # type: ignore[attr-defined]
+        target.unlink()
+        with chainfile.open(target, "xb") as stream:  # type: ignore[attr-defined]
             stream.write(content)
 
     monkeypatch.setattr(chainfile, "_replace", in_place)
     test_every_prefix = test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state
     with pytest.raises(InputError, match="no seal"):
-        test_every_prefix(posterior, old, new, path, monkeypatch, 1, KilledError())
+        test_every_prefix(posterior, old, new, path, monkeypatch, 2, KilledError())  # halfway through its one write
 
 
 # --- kills ------------------------------------------------------------------------------------------------
@@ -409,6 +410,15 @@ def test_a_second_writer_hears_who_the_first_is_before_any_work(
             run(posterior, None, path, TOTAL + 1, resume=True)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
     assert path.read_bytes() == before
+
+
+def test_links_at_the_hidden_files_lead_nowhere(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    for suffix in ("tmp", "writer"):
+        (tmp_path / f".chain.h5.{suffix}").symlink_to(precious)
+    assert run(posterior, estimate, tmp_path / "chain.h5").chain.shape[1] == TOTAL
+    assert precious.read_text() == "mine"
 
 
 def test_a_killed_writer_leaves_no_lock(posterior: Posterior, estimate: MapEstimate, path: Path) -> None:

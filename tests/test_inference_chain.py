@@ -3,15 +3,18 @@
 import math
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import arviz_stats
 import emcee
 import filelock
 import h5py
 import numba as nb
 import numpy as np
 import pytest
+import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
 from test_inference import EVERYTHING, make_model, make_posterior, make_truth
@@ -19,8 +22,8 @@ from test_inference import EVERYTHING, make_model, make_posterior, make_truth
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference import examine
-from bayesfred.inference.chainfile import Chain, fingerprint, open_chain
+from bayesfred.inference import ensembles, examine
+from bayesfred.inference.chainfile import Chain, fingerprint, open_chain, random_states, write_chain
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise
 from bayesfred.inference.posterior import Nuisances, Posterior
@@ -140,6 +143,17 @@ def test_resuming_anywhere_changes_no_bit(posterior: Posterior, estimate: MapEst
                 assert_same_file(path, whole.path)
     finally:
         nb.set_num_threads(before)
+
+
+def test_arviz_and_netcdf_read_the_chain(whole: Chain, tmp_path: Path) -> None:
+    tree = open_chain(whole.path).to_datatree()
+    tree.to_netcdf(tmp_path / "chain.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "chain.nc", engine="h5netcdf") as read:
+        assert set(read["posterior"].data_vars) == set(whole.parameter_names)
+        for name in whole.parameter_names:
+            assert np.array_equal(read["posterior"][name], tree["posterior"][name])
+        assert np.array_equal(read["sample_stats"]["lp"], tree["sample_stats"]["lp"])
+        assert float(arviz_stats.ess(read)["background"]) > 10
 
 
 @pytest.mark.parametrize("stops", [(1,), (5,), (11,), (2, 7)])
@@ -275,6 +289,24 @@ def test_an_estimate_off_the_posterior_is_refused(posterior: Posterior, estimate
 # --- accidents, of which test_inference_accidents.py has more ------------------------------------------------
 
 
+CALLS_OF_A_STEP = 4  # 2 an ensemble
+
+
+def spoilt(monkeypatch: pytest.MonkeyPatch, bad: Mapping[int, float], first: int = 2) -> None:
+    """Make the first walker's log-probability something else in the given calls after the walkers are placed."""
+    real, call = Posterior.unchecked_log_prob, -first
+
+    def spoil(self: Posterior, params: Any) -> Any:
+        nonlocal call
+        values = real(self, params)
+        if call in bad:
+            values[0] = bad[call]
+        call += 1
+        return values
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", spoil)
+
+
 @pytest.mark.parametrize("calls", [3, 6, 7, 20, 37])
 def test_an_interrupted_run_keeps_its_complete_steps(
     posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
@@ -301,6 +333,123 @@ def test_an_interrupted_run_keeps_its_complete_steps(
     assert not list(tmp_path.glob(".*.tmp"))
     assert draws_of(run(posterior, whole.estimate, path, resume=True)) == draws_of(whole)
     assert_same_file(path, whole.path)
+
+
+# --- log-probabilities and walkers that are none -----------------------------------------------------------
+
+
+def test_what_is_no_density_is_refused_and_counted(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad = {3: math.nan, 7: math.inf, 8: math.nan, 40: math.inf, 41: -math.inf}
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad)
+        chain = run(posterior, whole.estimate, tmp_path / "a.h5")
+    assert chain.n_invalid == open_chain(chain.path).n_invalid == 4 and whole.n_invalid == 0
+    assert np.isfinite(chain.log_prob).all() and np.isfinite(chain.chain).all()
+    assert chain.accepted.sum() < whole.accepted.sum()
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad)
+        run(posterior, whole.estimate, tmp_path / "b.h5", 5)
+    assert open_chain(tmp_path / "b.h5").n_invalid == 3
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad, first=-5 * CALLS_OF_A_STEP)
+        assert draws_of(run(posterior, None, tmp_path / "b.h5", resume=True)) == draws_of(chain)
+    assert_same_file(tmp_path / "b.h5", chain.path)
+
+
+def test_walkers_start_where_there_is_density(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoilt(monkeypatch, {-2: math.inf, -1: math.nan})
+    chain = run(posterior, whole.estimate, tmp_path / "chain.h5", 1)
+    assert chain.n_invalid == 2 and np.isfinite(chain.log_prob).all()
+
+
+def test_an_infinite_prior_density_is_no_density(posterior: Posterior) -> None:
+    undistorted = posterior.start()
+    assert math.isfinite(posterior.log_prob(undistorted))
+    infinite = Posterior(posterior.model, posterior.counts, prior={"f_ux": stats.gamma(0.5)})  # at 0
+    assert infinite.unchecked_log_prob(undistorted[None])[0] == math.inf
+    assert infinite.log_prob(undistorted) == -math.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda e: {"params": np.where(np.arange(13) == 3, np.nan, e.params)}, "no density around it"),
+        (lambda e: {"params": e.params[:12]}, "got 12 parameters, expected 13"),
+        (lambda e: {"covariance": -e.covariance}, "no positive definite covariance"),
+        (lambda e: {"covariance": np.ones((13, 13))}, "no positive definite covariance"),
+        (lambda e: {"covariance": np.nan * e.covariance}, "no positive definite covariance"),
+        (lambda e: {"covariance": e.covariance[:12]}, "no positive definite covariance"),
+        (lambda e: {"covariance": e.covariance * np.where(np.eye(13)[12] > 0, 1e-40, 1.0)[:, None] ** 0.5
+                    * np.where(np.eye(13)[12] > 0, 1e-40, 1.0) ** 0.5}, "the same background for all walkers"),
+    ],
+)  # fmt: skip
+def test_an_estimate_that_no_run_can_start_from_is_refused(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, change: Any, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        run(posterior, replace(estimate, **change(estimate)), tmp_path / "chain.h5", walkers=32)
+    assert not (tmp_path / "chain.h5").exists()
+
+
+def spoil_last_step(whole: Chain, path: Path, posterior: Posterior, name: str, values: Floats) -> None:
+    """A chain file whose last step has other walkers."""
+    array = getattr(whole, name).copy()
+    array[:, -1] = values
+    write_chain(replace(whole, path=path, **{name: array}), posterior, random_states(whole.path))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("log_prob", lambda a: np.full_like(a, -np.inf), "16 of 16 walkers without posterior density"),
+        ("log_prob", lambda a: np.where(np.arange(8) == 2, np.nan, a), "2 of 16 walkers without posterior density"),
+        ("log_prob", lambda a: np.where(np.arange(8) == 2, np.inf, a), "2 of 16 walkers without posterior density"),
+        ("chain", lambda a: np.where(np.arange(8)[:, None] == 2, np.nan, a), "2 of 16 walkers without posterior density"),
+        ("chain", lambda a: np.broadcast_to(a[:, :1], a.shape), "the same f_ux, .* for all walkers"),
+        ("chain", lambda a: np.repeat(a[:, ::2], 2, axis=1), "spread in 3 directions only, expected 7"),
+    ],
+)
+def test_a_run_that_cannot_go_on_is_refused(
+    posterior: Posterior, whole: Chain, tmp_path: Path, name: str, change: Any, words: str
+) -> None:
+    path = tmp_path / "chain.h5"
+    spoil_last_step(whole, path, posterior, name, change(getattr(whole, name)[:, -1]))
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=f"start: got .*{words}"):
+        run(posterior, None, path, TOTAL + 1, resume=True)
+    assert path.read_bytes() == before
+
+
+def test_a_stuck_walker_ends_the_run(posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One walker claims a density that no proposal has; the run says so, and what was sampled is there."""
+    monkeypatch.setattr(ensembles, "STUCK", 30)
+    path = tmp_path / "chain.h5"
+    spoil_last_step(whole, path, posterior, "log_prob", whole.log_prob[:, -1] + np.array([[1e6] + 7 * [0.0], 8 * [0.0]]))
+    with pytest.raises(InputError, match="1 of 16 walkers stuck, 30 steps without a move"):
+        run(posterior, None, path, 1000, resume=True)
+    kept = open_chain(path)
+    assert kept.chain.shape[1] == TOTAL + 30
+    assert np.ptp(kept.chain[0, -31:, 0], axis=0).max() == 0.0 < np.ptp(kept.chain[:, -31:, 1], axis=1).min()
+
+
+def test_an_ensemble_that_accepts_nothing_ends_the_run(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, real, placed = tmp_path / "chain.h5", Posterior.unchecked_log_prob, 2
+
+    def nothing(self: Posterior, params: Any) -> Any:
+        nonlocal placed
+        placed -= 1
+        return real(self, params) if placed >= 0 else np.full(len(params), -np.inf)
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", nothing)
+    with pytest.raises(InputError, match="16 of 16 walkers stuck, 125 steps without a move"):
+        run(posterior, estimate, path, None)  # 125 steps of 8 walkers are 1000 proposals
+    assert open_chain(path).chain.shape[1] == 125
 
 
 def damaged(whole: Path, how: str) -> bytes:

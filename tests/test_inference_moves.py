@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from test_inference import LIMIT
 
+from bayesfred.inference.ensembles import DE_SHARE
 from bayesfred.inference.moves import DEGREES_OF_FREEDOM, HEAVY_SHARE, LaplaceMove
-from bayesfred.inference.sampling import DE_SHARE
 
 Floats = NDArray[np.float64]
 

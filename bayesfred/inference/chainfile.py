@@ -182,11 +182,12 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
 def _replace(path: Path, content: memoryview) -> None:
     """Write a file under a temporary name, flush it to the disk, and rename it over `path`.
 
-    There is one writer, so there is one temporary name: what a killed run left under it is written over.
+    There is one writer, so there is one temporary name; what a killed run left under it goes, and so does a link.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with open(temporary, "wb") as stream:
+        temporary.unlink(missing_ok=True)
+        with open(temporary, "xb") as stream:
             stream.write(content)
             stream.write(seal(content))
             stream.flush()

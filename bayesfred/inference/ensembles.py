@@ -62,8 +62,12 @@ def begin(posterior: Posterior, estimate: MapEstimate, seed: int, ensembles: int
     Raises
     ------
     InputError
-        If the posterior has no density around the estimate.
+        If the estimate is not one of this posterior, or there is no density around it.
     """
+    if np.shape(estimate.params) != (posterior.n_parameters,):
+        raise InputError(
+            f"estimate: got {np.size(estimate.params)} parameters, expected {posterior.n_parameters}: find this posterior's maximum"
+        )
     move = LaplaceMove(estimate.params, estimate.covariance)
     log_prob_of = _LogProb(posterior, 0)
     states = []

@@ -36,7 +36,9 @@ def only_writer(path: Path) -> Iterator[None]:
     try:
         lock.acquire()
         since = datetime.now().astimezone().isoformat(" ", "seconds")
-        holder.write_text(f"process {os.getpid()} on {socket.gethostname()} since {since}", encoding="utf-8")
+        holder.unlink(missing_ok=True)
+        with open(holder, "x", encoding="utf-8") as stream:  # never through a link
+            stream.write(f"process {os.getpid()} on {socket.gethostname()} since {since}")
     except filelock.Timeout:
         raise InputError(
             f"{path}: another process is writing this chain{_told(holder)}, expected to be the only one: wait for it, or stop it"

@@ -62,7 +62,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
         self.mean = mean
         try:
-            self.lower = cholesky(covariance, lower=True)
+            self.lower = cholesky(np.reshape(covariance, (mean.size, mean.size)), lower=True)
         except (LinAlgError, ValueError):
             raise InputError("estimate: got no positive definite covariance, expected the maximum's: see find_map") from None
 
