@@ -243,6 +243,19 @@ def many_objects(file: h5py.File) -> None:
         file["versions"].create_group(f"{k}")
 
 
+@harm("more than 10000 objects")
+def objects_with_many_attributes(file: h5py.File) -> None:
+    for k in range(200):
+        file["versions"].create_group(f"{k}").attrs.update({f"{j}": 1.0 for j in range(60)})
+
+
+@harm("more than 10000 objects")
+def deep_groups(file: h5py.File) -> None:
+    group = file["versions"]
+    for _ in range(10_001):
+        group = group.create_group("g")
+
+
 @harm("of newer schema 3, expected bayesfred chain of schema 2: read it with the version that wrote it")
 def newer_schema(file: h5py.File) -> None:
     file.attrs["schema"] = examine.SCHEMA + 1

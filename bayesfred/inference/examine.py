@@ -25,7 +25,7 @@ SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 
 # More than any chain file has, and little enough to look through in an instant.
-MOST_OBJECTS = 10_000
+MOST_OBJECTS = 10_000  # attributes among them
 MOST_ATTRIBUTES = 100  # of one object
 LARGEST_ATTRIBUTE = 2**16  # bytes
 
@@ -107,20 +107,20 @@ def _check_schema(kind: Any, schema: Any) -> None:
 
 def _check_tree(root: Any, size: int) -> None:
     """Look at everything that can be reached from the root of a file of `size` bytes."""
-    seen, held, todo = set(), 0, [("", root)]
+    seen, number, held, todo = set(), 0, 0, [("", root)]
     while todo:
         name, node = todo.pop()
         address = h5o.get_info(node).addr
         if address in seen:
             raise InputError(f"{name}: got a second link to one object, expected each once: {MEND}")
         seen.add(address)
-        _check_attributes(name, node)
+        number += 1 + _check_attributes(name, node)
         if isinstance(node, h5d.DatasetID):
             held += _check_dataset(name, node)
             if held > size:
                 raise InputError(f"{name}: got arrays larger than the file, expected them to lie in it: {MEND}")
             continue
-        if node.get_num_objs() + len(seen) + len(todo) > MOST_OBJECTS:
+        if number + len(todo) + node.get_num_objs() > MOST_OBJECTS:
             raise InputError(f"{name or '/'}: got more than {MOST_OBJECTS} objects, expected those of a chain: {MEND}")
         for key in node:
             child = f"{name}/{key.decode(errors='replace')}"
@@ -132,8 +132,9 @@ def _check_tree(root: Any, size: int) -> None:
             todo.append((child, item))
 
 
-def _check_attributes(name: str, node: Any) -> None:
-    number = h5a.get_num_attrs(node)
+def _check_attributes(name: str, node: Any) -> int:
+    """How many attributes there are, all of them small."""
+    number = int(h5a.get_num_attrs(node))
     if number > MOST_ATTRIBUTES:
         raise InputError(f"{name or '/'}: got {number} attributes, expected at most {MOST_ATTRIBUTES}: {MEND}")
     for k in range(number):
@@ -145,6 +146,7 @@ def _check_attributes(name: str, node: Any) -> None:
         _check_type(label, kind, texts=True)
         if math.prod(item.shape) * kind.get_size() > LARGEST_ATTRIBUTE:
             raise InputError(f"{label}: got an attribute of shape {item.shape}, expected a small one: {MEND}")
+    return number
 
 
 def _check_dataset(name: str, node: Any) -> int:
