@@ -128,7 +128,7 @@ def test_emcee_reads_the_file(whole: Chain) -> None:
 
 def test_resuming_anywhere_changes_no_bit(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
     """10 stops at random, on 1 and 2 threads, against one run that never stopped."""
-    total, before = 60, nb.get_num_threads()
+    total, before = 40, nb.get_num_threads()
     whole = run(posterior, estimate, tmp_path / "whole.h5", total)
     stops = np.random.default_rng(52).choice(total - 1, 10, replace=False) + 1
     try:
