@@ -1,8 +1,10 @@
 """The command line: options in, exit codes out. What a command does is in `runs.py`.
 
-Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, 130 interrupted with everything saved.
+Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, or not verified, 130 interrupted, or
+terminated, with everything saved.
 """
 
+import signal
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,8 +17,6 @@ from bayesfred.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bayesfred.runs import Result
-
 app = typer.Typer(
     help="Posterior of an imaging system's field distortion, from a frame of photon counts.",
     add_completion=False,
@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 
 Run = Annotated[Path, typer.Argument(metavar="RUN.toml", help="The run file.", show_default=False)]
+ChainFile = Annotated[Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the output file.")]
 
@@ -43,7 +44,7 @@ def demo(
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 coefficients, Poisson counts."""
-    _run(lambda: bf.runs.demo(folder, seed=seed, overwrite=overwrite))
+    _run(lambda: bf.runs.demo(folder, seed=seed, overwrite=overwrite).diagnostics.converged)
 
 
 @app.command()
@@ -55,29 +56,41 @@ def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
 @app.command(epilog="A complete run file:\n\n" + _example())
 def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
-    _run(lambda: bf.runs.fit(run_file, resume=resume, overwrite=overwrite))
+    _run(lambda: bf.runs.fit(run_file, resume=resume, overwrite=overwrite).diagnostics.converged)
 
 
 @app.command()
 def report(
-    chain_file: Annotated[Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)],
+    chain_file: ChainFile,
     target_ess: Annotated[
         float | None, typer.Option(min=1, help="Effective draws to ask of every parameter.", show_default="the run's")
     ] = None,
 ) -> None:
     """Judge a chain file anew and write its report, .html and .png, beside it."""
-    _run(lambda: bf.runs.report(chain_file, target_ess=target_ess))
+    _run(lambda: bf.runs.report(chain_file, target_ess=target_ess).diagnostics.converged)
 
 
-def _run(work: "Callable[[], Result | None]") -> None:
-    """Do a command's work; bad input becomes one line and exit code 2."""
+@app.command()
+def verify(
+    chain_file: ChainFile,
+    every_draw: Annotated[bool, typer.Option("--all", help="Every draw's log-probability, not 1,000 of them.")] = False,
+) -> None:
+    """Compute again what a chain file holds: hashes, log-probabilities, the maximum, the first steps from the seed."""
+    _run(lambda: bf.runs.verify(chain_file, every_draw=every_draw))
+
+
+def _run(work: "Callable[[], bool | None]") -> None:
+    """Do a command's work, which says whether all is well; bad input becomes one line and exit code 2."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # to end as after a Ctrl-C
     try:
-        result = work()
+        well = work()
     except InputError as error:
         typer.echo(f"bayesfred: {error}", err=True)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
         typer.echo("bayesfred: interrupted; a run that was sampling has saved its steps: go on with --resume", err=True)
         raise typer.Exit(130) from None
-    if result is not None and not result.diagnostics.converged:
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    if well is False:
         raise typer.Exit(3)

@@ -22,12 +22,11 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference import priors
+from bayesfred.inference import priors, verification
 from bayesfred.inference.chainfile import Chain, open_chain
-from bayesfred.inference.estimate import find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.inference.posterior import Nuisances, Posterior
-from bayesfred.inference.sampling import sample
+from bayesfred.inference.sampling import sample, versions
 from bayesfred.reporting import html, plots
 
 Floats = npt.NDArray[np.float64]
@@ -178,6 +177,32 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
     return _report(chain, chain.posterior(), Path(chain_file).stem, [], target_ess=target_ess or chain.target_ess)
 
 
+def verify(chain_file: PathLike, *, every_draw: bool = False) -> bool:
+    """Compute again what a chain file holds, and print what holds as a table.
+
+    Parameters
+    ----------
+    chain_file : path-like
+    every_draw : bool
+        Compute the log-probability of every draw, not of 1,000 evenly spaced ones.
+
+    Returns
+    -------
+    bool
+        Whether everything holds.
+    """
+    checks = verification.verify(Path(chain_file), every_draw=every_draw)
+    table = Table("what", "finding", "holds")
+    for check in checks:
+        table.add_row(check.what, check.finding, "yes" if check.holds else "no")
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    made = open_chain(chain_file).versions
+    others = [f"{name} {made.get(name)} (here {here})" for name, here in versions().items() if made.get(name) != here]
+    if others:
+        print(f"made with {', '.join(others)}")
+    return all(check.holds for check in checks)
+
+
 def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:
     """A simulated frame's posterior and the true parameters."""
     s = run.simulation
@@ -255,15 +280,11 @@ def _fit(
         raise InputError(f"{output}: no folder {output.parent}, expected one to write the chain to: create it")
     if output.exists() and not (overwrite or resume):  # said before the work, not after it
         raise InputError(f"{output}: exists, expected a new file: go on with --resume, or replace it with --overwrite")
-    estimate = None
-    if not (resume and output.exists()):
-        with Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)"):
-            estimate = find_map(posterior)
-        print(f"maximum: {estimate.message}")
     chain = sample(
-        posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
+        posterior, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
         target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
     )  # fmt: skip
+    print(f"maximum: {chain.estimate.message}")
     return _report(chain, posterior, title, notes, target_ess=s.target_ess, truth=truth, run=run)
 
 
@@ -281,6 +302,8 @@ def _report(
     diagnostics = diagnose(chain, target_ess=target_ess)
     # a file or a pipe has no width of its own
     Console(width=None if sys.stdout.isatty() else 120).print(_table(chain, diagnostics, truth))
+    if chain.n_invalid:
+        print(f"{chain.n_invalid} log-probabilities were NaN or infinite and taken as -inf: narrower priors avoid that")
     page = html.write_report(
         chain.path.with_suffix(".html"), title=title, chain=chain, diagnostics=diagnostics, posterior=posterior, truth=truth,
         notes=notes, settings=run.model_dump_json(indent=2) if run else None,

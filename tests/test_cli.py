@@ -31,6 +31,7 @@ from bayesfred import files
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.cli import app
 from bayesfred.inference.chainfile import Chain, open_chain
+from bayesfred.inference.examine import seal
 from bayesfred.inference.posterior import Posterior
 from bayesfred.settings import read_settings
 
@@ -90,8 +91,9 @@ def environment(**extra: str) -> dict[str, str]:
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-    """Every file and folder below a folder, with its content."""
-    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in sorted(folder.rglob("*"))}
+    """Every file and folder below a folder, with its content; the lock, which stays, left out."""
+    found = [p for p in sorted(folder.rglob("*")) if p.suffix != ".lock"]
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in found}
 
 
 def z_scores(chain: Chain, truth: dict[str, float]) -> dict[str, float]:
@@ -214,6 +216,33 @@ def test_report_that_asks_for_more_than_there_is_exits_with_3(finished: tuple[Pa
     assert re.search(r"^not converged: effective sample size \d+ of \w+ is below 1000000$", output.stdout, re.M)
 
 
+def test_verify_says_what_holds(finished: tuple[Path, Output], tmp_path: Path) -> None:
+    """Exit code 0 for the run as it is, 3 for one that claims another seed, 2 for one that was changed."""
+    shutil.copy(finished[0] / "run.h5", tmp_path)
+    before = snapshot(tmp_path)
+    output = invoke(tmp_path, "verify", "run.h5", "--all")
+    assert output.code == 0
+    assert snapshot(tmp_path) == before
+    rows = [line for line in output.stdout.splitlines() if re.search(r" (yes|no) +│$", line)]
+    assert len(rows) == 8
+    assert all(" yes " in row for row in rows)
+    draws = np.prod(open_chain(tmp_path / "run.h5").log_prob.shape)
+    assert f"{draws} of {draws} draws" in output.stdout
+    assert "made with" not in output.stdout
+
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "a") as file:
+        file.attrs["seed"] = 99
+        file["versions"].attrs["numpy"] = np.bytes_("1.0")
+    assert_refused(invoke(tmp_path, "verify", "run.h5"), "run.h5", "seal")
+    path.write_bytes(path.read_bytes() + seal(path.read_bytes()))
+    output = invoke(tmp_path, "verify", "run.h5")
+    assert output.code == 3
+    assert re.search(r"│ first steps +│ \d+ made again from seed 99: differ from step 1 on +│ no ", output.stdout)
+    assert re.search(r"│ log-probability +│ 1000 of \d+ draws: differ by at most 0 +│ yes ", output.stdout)
+    assert f"made with numpy 1.0 (here {np.__version__})" in output.stdout
+
+
 def test_too_few_steps_then_resume_then_overwrite(folder: Path) -> None:
     (folder / "run.toml").write_text(run_text(sampling=FEW_STEPS), encoding="utf-8")
     first = invoke(folder, "fit", "run.toml")
@@ -293,7 +322,7 @@ def test_example_in_help_is_a_run_file(tmp_path: Path) -> None:
 
 def test_every_command_is_explained(tmp_path: Path) -> None:
     listed = invoke(tmp_path, "--help").stdout
-    for name in ("demo", "simulate", "fit", "report"):
+    for name in ("demo", "simulate", "fit", "report", "verify"):
         assert re.search(rf"^\s+{name}\s+\w", listed, re.M)
         assert invoke(tmp_path, name, "--help").code == 0
 
@@ -384,7 +413,7 @@ REFUSALS = [
     Refusal("unknown true term", sections(**{"simulation.theta": "f_zz = 1"}), ("run.toml", "simulation.theta", "f_zz"), SIMULATE),
     Refusal("simulated files exist", unchanged, ("exists", "--overwrite"), ("simulate", "run.toml")),
     Refusal("missing chain", unchanged, ("absent.h5", "no such file"), ("report", "absent.h5")),
-    Refusal("no chain", unchanged, ("frame.fits", "HDF5"), ("report", "frame.fits")),
+    Refusal("no chain", unchanged, ("frame.fits", "seal"), ("report", "frame.fits")),
 ]
 
 # What is wrong here is found by the objects that the run file describes, which name the field.
@@ -529,10 +558,8 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes], 
         time.sleep(0.02)
 
 
-@pytest.fixture(scope="module")
-def interrupted(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, list[str]]:
-    """A run of very many steps that got a Ctrl-C once it had made some: folder, exit code, lines on standard error."""
-    folder = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("interrupted") / "here"))
+def stop_a_run(folder: Path, number: signal.Signals) -> tuple[int, list[str]]:
+    """Begin a run of very many steps and send it a signal once it has made some: exit code, lines on standard error."""
     sections(sampling="steps = 100000")(folder)
     # the progress bar counts steps on standard error, also in a file if it takes that for a terminal
     env = environment(FORCE_COLOR="1", TERM="xterm", COLUMNS="120")
@@ -541,12 +568,19 @@ def interrupted(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
         process = subprocess.Popen(command("fit", "run.toml"), cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=stderr)
     try:
         wait_for(lambda: re.search(rb"\b[1-9]\d* steps", log.read_bytes()), process, 180)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         code = process.wait(60)
     finally:
         process.kill()
         process.wait()
-    return folder, code, messages(log.read_text(encoding="utf-8"))
+    return code, messages(log.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def interrupted(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, list[str]]:
+    """A run that got a Ctrl-C: folder, exit code, lines on standard error."""
+    folder = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("interrupted") / "here"))
+    return folder, *stop_a_run(folder, signal.SIGINT)
 
 
 def messages(text: str) -> list[str]:
@@ -583,19 +617,31 @@ def test_ctrl_c_saves_the_steps(interrupted: tuple[Path, int, list[str]]) -> Non
     np.testing.assert_array_equal(unbroken.accepted, resumed.accepted)
 
 
+def test_termination_saves_the_steps(simulated: Path, tmp_path: Path) -> None:
+    """SIGTERM, as batch systems send it, ends a run as Ctrl-C does."""
+    folder = Path(shutil.copytree(simulated, tmp_path / "here"))
+    code, lines = stop_a_run(folder, signal.SIGTERM)
+    assert code == 130
+    assert lines[-1].startswith("bayesfred: interrupted; ")
+    steps = open_chain(folder / "run.h5").chain.shape[1]
+    sections(sampling=f"steps = {steps + 1}")(folder)
+    assert invoke(folder, "fit", "run.toml", "--resume").code == 3
+    assert open_chain(folder / "run.h5").chain.shape[1] == steps + 1
+
+
 def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ensembles take turns, two calls a step; the 30th call, the first four being the walkers' places, is in the fourth step."""
-    log_prob = Posterior.log_prob
+    log_prob = Posterior.unchecked_log_prob
     calls = 0
 
     def stop(posterior: Posterior, params: NDArray[np.float64]) -> object:
         nonlocal calls
-        calls += np.ndim(params) == 2
+        calls += len(params) > 1  # the search for the maximum asks for one at a time
         if calls == 30:
             raise KeyboardInterrupt
         return log_prob(posterior, params)
 
-    monkeypatch.setattr(Posterior, "log_prob", stop)
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", stop)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 130
     assert open_chain(folder / "run.h5").chain.shape[1] == 3
@@ -607,7 +653,7 @@ def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bayesfred.runs.find_map", stop)
+    monkeypatch.setattr("bayesfred.inference.sampling.find_map", stop)
     before = snapshot(folder)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 130

@@ -1,18 +1,20 @@
 """Runs and their files: resuming, interrupts, damage, and what others can read of them."""
 
 import math
-import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import arviz_stats
 import emcee
 import filelock
 import h5py
 import numba as nb
 import numpy as np
 import pytest
+import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
 from test_inference import EVERYTHING, make_model, make_posterior, make_truth
@@ -20,7 +22,8 @@ from test_inference import EVERYTHING, make_model, make_posterior, make_truth
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference.chainfile import Chain, fingerprint, open_chain
+from bayesfred.inference import ensembles, examine
+from bayesfred.inference.chainfile import Chain, fingerprint, open_chain, random_states, write_chain
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise
 from bayesfred.inference.posterior import Nuisances, Posterior
@@ -78,6 +81,12 @@ def assert_same_file(a: Path, b: Path) -> None:
     assert [key for key in first if first[key] != second[key] and first[key] == first[key]] == []
 
 
+def reseal(path: Path) -> None:
+    """Give a file that was edited the seal that its content asks for, as anybody can."""
+    content = path.read_bytes().rsplit(b"\nbayesfred sha256", 1)[0]
+    path.write_bytes(content + examine.seal(content))
+
+
 # --- runs -------------------------------------------------------------------------------------------------
 
 
@@ -117,6 +126,36 @@ def test_emcee_reads_the_file(whole: Chain) -> None:
         np.random.RandomState().set_state(backend.random_state)
 
 
+def test_resuming_anywhere_changes_no_bit(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
+    """10 stops at random, on 1 and 2 threads, against one run that never stopped."""
+    total, before = 40, nb.get_num_threads()
+    whole = run(posterior, estimate, tmp_path / "whole.h5", total)
+    stops = np.random.default_rng(52).choice(total - 1, 10, replace=False) + 1
+    try:
+        for threads in range(1, min(2, nb.config.NUMBA_NUM_THREADS) + 1):
+            nb.set_num_threads(threads)
+            for stop in stops:
+                path = tmp_path / f"{threads}-{stop}.h5"
+                run(posterior, estimate, path, int(stop))
+                chain = run(posterior, None, path, total, resume=True)
+                for name in ("chain", "log_prob", "accepted"):
+                    assert np.array_equal(getattr(chain, name), getattr(whole, name)), (threads, stop, name)
+                assert_same_file(path, whole.path)
+    finally:
+        nb.set_num_threads(before)
+
+
+def test_arviz_and_netcdf_read_the_chain(whole: Chain, tmp_path: Path) -> None:
+    tree = open_chain(whole.path).to_datatree()
+    tree.to_netcdf(tmp_path / "chain.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "chain.nc", engine="h5netcdf") as read:
+        assert set(read["posterior"].data_vars) == set(whole.parameter_names)
+        for name in whole.parameter_names:
+            assert np.array_equal(read["posterior"][name], tree["posterior"][name])
+        assert np.array_equal(read["sample_stats"]["lp"], tree["sample_stats"]["lp"])
+        assert float(arviz_stats.ess(read)["background"]) > 10
+
+
 @pytest.mark.parametrize("stops", [(1,), (5,), (11,), (2, 7)])
 def test_a_resumed_run_is_the_uninterrupted_one(
     posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path, stops: tuple[int, ...]
@@ -127,6 +166,17 @@ def test_a_resumed_run_is_the_uninterrupted_one(
         assert chain.chain.shape[1] == stop
     assert draws_of(chain) == draws_of(whole)
     assert_same_file(path, whole.path)
+
+
+def test_another_state_of_the_random_numbers_is_seen(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
+    """What tests of resuming rest on: it is not enough that the positions are right."""
+    path = tmp_path / "chain.h5"
+    run(posterior, whole.estimate, path, 5)
+    with h5py.File(path, "a") as file:
+        file["ensemble_1"].attrs["random_state_2"] = (file["ensemble_1"].attrs["random_state_2"] + 2) % 624
+    reseal(path)
+    resumed = run(posterior, None, path, resume=True)
+    assert np.array_equal(resumed.chain[0], whole.chain[0]) and not np.array_equal(resumed.chain[1], whole.chain[1])
 
 
 def test_a_resumed_run_needs_neither_estimate_nor_the_same_settings(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
@@ -236,42 +286,25 @@ def test_an_estimate_off_the_posterior_is_refused(posterior: Posterior, estimate
         run(posterior, far, tmp_path / "chain.h5")
 
 
-# --- accidents --------------------------------------------------------------------------------------------
+# --- accidents, of which test_inference_accidents.py has more ------------------------------------------------
 
 
-class AccidentError(Exception):
-    """What the tests below make happen."""
+CALLS_OF_A_STEP = 4  # 2 an ensemble
 
 
-@pytest.mark.parametrize("where", ["open", "dataset", "attribute", "fsync", "rename"])
-def test_a_failed_write_leaves_the_old_file(
-    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
-) -> None:
-    path = tmp_path / "chain.h5"
-    shutil.copy(whole.path, path)
-    owner, name, after = {
-        "open": (h5py.File, "__init__", 0),
-        "dataset": (h5py.Group, "create_dataset", 6),
-        "attribute": (h5py.AttributeManager, "__setitem__", 60),
-        "fsync": (os, "fsync", 0),
-        "rename": (os, "replace", 0),
-    }[where]
-    real, calls = getattr(owner, name), 0
+def spoilt(monkeypatch: pytest.MonkeyPatch, bad: Mapping[int, float], first: int = 2) -> None:
+    """Make the first walker's log-probability something else in the given calls after the walkers are placed."""
+    real, call = Posterior.unchecked_log_prob, -first
 
-    def fail(*args: Any, **kwargs: Any) -> Any:
-        nonlocal calls
-        calls += any(tmp_path.glob(".*.tmp")) or str(args[1:2]).count(".tmp")
-        if calls > after:
-            raise AccidentError
-        return real(*args, **kwargs)
+    def spoil(self: Posterior, params: Any) -> Any:
+        nonlocal call
+        values = real(self, params)
+        if call in bad:
+            values[0] = bad[call]
+        call += 1
+        return values
 
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, name, fail)
-        with pytest.raises(AccidentError):
-            run(posterior, whole.estimate, path, TOTAL + 1, resume=True)
-    assert path.read_bytes() == whole.path.read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir() if "lock" not in p.name) == ["chain.h5"]
-    assert run(posterior, whole.estimate, path, TOTAL + 1, resume=True).chain.shape[1] == TOTAL + 1
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", spoil)
 
 
 @pytest.mark.parametrize("calls", [3, 6, 7, 20, 37])
@@ -279,7 +312,7 @@ def test_an_interrupted_run_keeps_its_complete_steps(
     posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
     # 2 calls place the walkers, emcee evaluates none again, and a step is 2 calls an ensemble
-    path, real, left = tmp_path / "chain.h5", Posterior.log_prob, calls
+    path, real, left = tmp_path / "chain.h5", Posterior.unchecked_log_prob, calls
 
     def interrupted(self: Posterior, params: Any) -> Any:
         nonlocal left
@@ -289,7 +322,7 @@ def test_an_interrupted_run_keeps_its_complete_steps(
         return real(self, params)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Posterior, "log_prob", interrupted)
+        patch.setattr(Posterior, "unchecked_log_prob", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(posterior, whole.estimate, path)
     complete = (calls - 2) // 4
@@ -300,6 +333,123 @@ def test_an_interrupted_run_keeps_its_complete_steps(
     assert not list(tmp_path.glob(".*.tmp"))
     assert draws_of(run(posterior, whole.estimate, path, resume=True)) == draws_of(whole)
     assert_same_file(path, whole.path)
+
+
+# --- log-probabilities and walkers that are none -----------------------------------------------------------
+
+
+def test_what_is_no_density_is_refused_and_counted(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad = {3: math.nan, 7: math.inf, 8: math.nan, 40: math.inf, 41: -math.inf}
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad)
+        chain = run(posterior, whole.estimate, tmp_path / "a.h5")
+    assert chain.n_invalid == open_chain(chain.path).n_invalid == 4 and whole.n_invalid == 0
+    assert np.isfinite(chain.log_prob).all() and np.isfinite(chain.chain).all()
+    assert chain.accepted.sum() < whole.accepted.sum()
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad)
+        run(posterior, whole.estimate, tmp_path / "b.h5", 5)
+    assert open_chain(tmp_path / "b.h5").n_invalid == 3
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad, first=-5 * CALLS_OF_A_STEP)
+        assert draws_of(run(posterior, None, tmp_path / "b.h5", resume=True)) == draws_of(chain)
+    assert_same_file(tmp_path / "b.h5", chain.path)
+
+
+def test_walkers_start_where_there_is_density(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoilt(monkeypatch, {-2: math.inf, -1: math.nan})
+    chain = run(posterior, whole.estimate, tmp_path / "chain.h5", 1)
+    assert chain.n_invalid == 2 and np.isfinite(chain.log_prob).all()
+
+
+def test_an_infinite_prior_density_is_no_density(posterior: Posterior) -> None:
+    undistorted = posterior.start()
+    assert math.isfinite(posterior.log_prob(undistorted))
+    infinite = Posterior(posterior.model, posterior.counts, prior={"f_ux": stats.gamma(0.5)})  # at 0
+    assert infinite.unchecked_log_prob(undistorted[None])[0] == math.inf
+    assert infinite.log_prob(undistorted) == -math.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda e: {"params": np.where(np.arange(13) == 3, np.nan, e.params)}, "no density around it"),
+        (lambda e: {"params": e.params[:12]}, "got 12 parameters, expected 13"),
+        (lambda e: {"covariance": -e.covariance}, "no positive definite covariance"),
+        (lambda e: {"covariance": np.ones((13, 13))}, "no positive definite covariance"),
+        (lambda e: {"covariance": np.nan * e.covariance}, "no positive definite covariance"),
+        (lambda e: {"covariance": e.covariance[:12]}, "no positive definite covariance"),
+        (lambda e: {"covariance": e.covariance * np.where(np.eye(13)[12] > 0, 1e-40, 1.0)[:, None] ** 0.5
+                    * np.where(np.eye(13)[12] > 0, 1e-40, 1.0) ** 0.5}, "the same background for all walkers"),
+    ],
+)  # fmt: skip
+def test_an_estimate_that_no_run_can_start_from_is_refused(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, change: Any, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        run(posterior, replace(estimate, **change(estimate)), tmp_path / "chain.h5", walkers=32)
+    assert not (tmp_path / "chain.h5").exists()
+
+
+def spoil_last_step(whole: Chain, path: Path, posterior: Posterior, name: str, values: Floats) -> None:
+    """A chain file whose last step has other walkers."""
+    array = getattr(whole, name).copy()
+    array[:, -1] = values
+    write_chain(replace(whole, path=path, **{name: array}), posterior, random_states(whole.path))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("log_prob", lambda a: np.full_like(a, -np.inf), "16 of 16 walkers without posterior density"),
+        ("log_prob", lambda a: np.where(np.arange(8) == 2, np.nan, a), "2 of 16 walkers without posterior density"),
+        ("log_prob", lambda a: np.where(np.arange(8) == 2, np.inf, a), "2 of 16 walkers without posterior density"),
+        ("chain", lambda a: np.where(np.arange(8)[:, None] == 2, np.nan, a), "2 of 16 walkers without posterior density"),
+        ("chain", lambda a: np.broadcast_to(a[:, :1], a.shape), "the same f_ux, .* for all walkers"),
+        ("chain", lambda a: np.repeat(a[:, ::2], 2, axis=1), "spread in 3 directions only, expected 7"),
+    ],
+)
+def test_a_run_that_cannot_go_on_is_refused(
+    posterior: Posterior, whole: Chain, tmp_path: Path, name: str, change: Any, words: str
+) -> None:
+    path = tmp_path / "chain.h5"
+    spoil_last_step(whole, path, posterior, name, change(getattr(whole, name)[:, -1]))
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=f"start: got .*{words}"):
+        run(posterior, None, path, TOTAL + 1, resume=True)
+    assert path.read_bytes() == before
+
+
+def test_a_stuck_walker_ends_the_run(posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One walker claims a density that no proposal has; the run says so, and what was sampled is there."""
+    monkeypatch.setattr(ensembles, "STUCK", 30)
+    path = tmp_path / "chain.h5"
+    spoil_last_step(whole, path, posterior, "log_prob", whole.log_prob[:, -1] + np.array([[1e6] + 7 * [0.0], 8 * [0.0]]))
+    with pytest.raises(InputError, match="1 of 16 walkers stuck, 30 steps without a move"):
+        run(posterior, None, path, 1000, resume=True)
+    kept = open_chain(path)
+    assert kept.chain.shape[1] == TOTAL + 30
+    assert np.ptp(kept.chain[0, -31:, 0], axis=0).max() == 0.0 < np.ptp(kept.chain[:, -31:, 1], axis=1).min()
+
+
+def test_an_ensemble_that_accepts_nothing_ends_the_run(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, real, placed = tmp_path / "chain.h5", Posterior.unchecked_log_prob, 2
+
+    def nothing(self: Posterior, params: Any) -> Any:
+        nonlocal placed
+        placed -= 1
+        return real(self, params) if placed >= 0 else np.full(len(params), -np.inf)
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", nothing)
+    with pytest.raises(InputError, match="16 of 16 walkers stuck, 125 steps without a move"):
+        run(posterior, estimate, path, None)  # 125 steps of 8 walkers are 1000 proposals
+    assert open_chain(path).chain.shape[1] == 125
 
 
 def damaged(whole: Path, how: str) -> bytes:
@@ -330,13 +480,17 @@ def test_missing_and_foreign_files_are_refused(whole: Chain, tmp_path: Path) -> 
             open_chain(absent)
     with h5py.File(path, "w") as file:
         file["image"] = np.zeros(3)
+    with pytest.raises(InputError, match="got no seal at the end"):
+        open_chain(path)
+    reseal(path)
     with pytest.raises(InputError, match="got None of schema None"):
         open_chain(path)
     for spoil in ("schema", "kind"):
         shutil.copy(whole.path, path)
         with h5py.File(path, "a") as file:
             file.attrs[spoil] = 99
-        with pytest.raises(InputError, match="expected 'bayesfred chain' of schema"):
+        reseal(path)
+        with pytest.raises(InputError, match="expected bayesfred chain of schema"):
             open_chain(path)
 
 
@@ -346,6 +500,7 @@ def test_incomplete_files_are_refused(whole: Chain, tmp_path: Path, part: str) -
     shutil.copy(whole.path, path)
     with h5py.File(path, "a") as file:
         del file[part]
+    reseal(path)
     with pytest.raises(InputError, match=r"chain\.h5: "):
         open_chain(path)
 

@@ -21,11 +21,11 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
+from bayesfred.inference.ensembles import DE_SHARE
 from bayesfred.inference.estimate import find_map
 from bayesfred.inference.moves import DEGREES_OF_FREEDOM, HEAVY_SHARE, LaplaceMove
 from bayesfred.inference.noise import simulate
 from bayesfred.inference.posterior import Nuisances, Posterior
-from bayesfred.inference.sampling import DE_SHARE
 
 Floats = NDArray[np.float64]
 

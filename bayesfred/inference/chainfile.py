@@ -1,17 +1,21 @@
 """The chain file: one HDF5 file a run, which holds everything needed to judge, replay and go on with it.
 
 Groups `ensemble_0`, ... are in emcee's own layout. Beside them stand the posterior itself (frame, mask, model, noise,
-nuisances, priors), the MAP, the seed and the versions of what made it. A checkpoint writes the whole file anew and
-renames it over the old one, so that a reader finds either the old state or the new one.
+nuisances, priors), the MAP, the seed and the versions of what made it. A checkpoint writes the whole file anew, from memory,
+and renames it over the old one, so that a reader finds either the old state or the new one. `examine.py` says what a file
+must be before it is read.
 """
 
 import hashlib
+import io
+import math
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import arviz_base
 import h5py
@@ -21,14 +25,14 @@ import xarray as xr
 
 from bayesfred.errors import InputError
 from bayesfred.inference.estimate import MapEstimate
+from bayesfred.inference.examine import KIND, SCHEMA, examined, seal
 from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
 
-Read = TypeVar("Read")
-
-KIND = "bayesfred chain"
-SCHEMA = 1
+# The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
+FORMAT = ("v110", "v110")
+LARGEST_CHUNK = 2**24  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,7 @@ class Chain:
     accepted : ndarray, shape (n_ensembles, n_walkers)
         Moves accepted so far.
     burn_in : int
-        Steps that `draws` leaves out.
+        Steps that `draws` leaves out; half of all while the run goes on.
     seed : int
     estimate : MapEstimate
         The maximum that the proposals are centred on.
@@ -54,6 +58,8 @@ class Chain:
         Packages that the run was made with.
     target_ess : float
         Effective draws that were asked for.
+    n_invalid : int
+        Log-probabilities that came out as NaN or +inf and were taken as -inf.
     """
 
     path: Path
@@ -66,6 +72,7 @@ class Chain:
     estimate: MapEstimate
     versions: dict[str, str]
     target_ess: float = 1000.0
+    n_invalid: int = 0
 
     def draws(self) -> Floats:
         """All draws after burn-in, shape (n, d)."""
@@ -83,7 +90,8 @@ class Chain:
 
     def posterior(self) -> Posterior:
         """The posterior that was sampled, rebuilt from the file."""
-        return _reading(self.path, lambda file: Posterior.read(file["posterior"]))
+        with examined(self.path) as file:
+            return Posterior.read(file["posterior"])
 
 
 def open_chain(path: str | os.PathLike[str]) -> Chain:
@@ -100,7 +108,7 @@ def open_chain(path: str | os.PathLike[str]) -> Chain:
     Raises
     ------
     InputError
-        If the file is missing, is no chain file, or was written in another schema.
+        If the file is missing, is no chain file, was changed or damaged since it was written, or is of another schema.
 
     Examples
     --------
@@ -109,17 +117,14 @@ def open_chain(path: str | os.PathLike[str]) -> Chain:
     ...
     bayesfred.errors.InputError: absent.h5: no such file, expected a chain written by `bayesfred fit`: check the path
     """
-    return _reading(Path(path), lambda file: _read(Path(path), file))
+    with examined(Path(path)) as file:
+        return _read(Path(path), file)
 
 
 def random_states(path: Path) -> list[tuple[Any, ...]]:
     """The state of every ensemble's random numbers after its last step."""
-
-    def read(file: h5py.File) -> list[tuple[Any, ...]]:
-        groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
-        return [tuple(group.attrs[f"random_state_{i}"] for i in range(5)) for group in groups]
-
-    return _reading(path, read)
+    with examined(path) as file:
+        return [_random_state(file[f"ensemble_{k}"].attrs) for k in range(int(file.attrs["ensembles"]))]
 
 
 def fingerprint(posterior: Posterior) -> dict[str, str]:
@@ -129,10 +134,16 @@ def fingerprint(posterior: Posterior) -> dict[str, str]:
         return {name: _digest(file[name]) for name in file}
 
 
+def changed_parts(path: Path, posterior: Posterior) -> list[str]:
+    """Which parts of a posterior are not those that a chain file holds."""
+    with examined(path) as file:
+        stored = {name: _digest(file["posterior"][name]) for name in file["posterior"]}
+    return [name for name, digest in fingerprint(posterior).items() if stored.get(name) != digest]
+
+
 def check_same_posterior(path: Path, posterior: Posterior) -> None:
     """Refuse a chain file whose frame, model, noise or priors are not those of the posterior."""
-    stored = _reading(path, lambda file: {name: _digest(file["posterior"][name]) for name in file["posterior"]})
-    changed = [name for name, digest in fingerprint(posterior).items() if stored.get(name) != digest]
+    changed = changed_parts(path, posterior)
     if changed:
         raise InputError(
             f"{path}: the run was made with other {', '.join(changed)}, expected the same to resume: write to another file or "
@@ -141,40 +152,45 @@ def check_same_posterior(path: Path, posterior: Posterior) -> None:
 
 
 def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, ...]]) -> None:
-    """Replace the chain's file by one that holds its present state."""
-
-    def fill(file: h5py.File) -> None:
-        file.attrs.update(kind=KIND, schema=SCHEMA, seed=chain.seed, burn_in=chain.burn_in, ensembles=len(chain.chain))
-        file.attrs["parameter_names"] = list(chain.parameter_names)
-        file.attrs["target_ess"] = chain.target_ess
+    """Replace the chain's file by one that holds its present state; InputError if that cannot be written."""
+    content = io.BytesIO()  # so that a full disk meets plain writing, not HDF5 halfway through
+    with h5py.File(content, "w", libver=FORMAT) as file:
+        file.attrs.update(kind=np.bytes_(KIND), schema=SCHEMA, seed=chain.seed, burn_in=chain.burn_in, ensembles=len(chain.chain))
+        file.attrs["parameter_names"] = np.array(chain.parameter_names, dtype=np.bytes_)
+        file.attrs.update(target_ess=chain.target_ess, n_invalid=chain.n_invalid)
         versions = file.create_group("versions")
-        versions.attrs.update(chain.versions)
+        versions.attrs.update({name: np.bytes_(version) for name, version in chain.versions.items()})
         posterior.write(file.create_group("posterior"))
         chain.estimate.write(file.create_group("estimate"))
         for k, state in enumerate(states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
-
-    _replace(chain.path, fill)
+    _replace(chain.path, content.getbuffer())
 
 
 def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) -> None:
     """One ensemble as emcee's own backend lays it out."""
     _, steps, walkers, d = chain.chain.shape
-    group.attrs.update(version=chain.versions["emcee"], nwalkers=walkers, ndim=d, has_blobs=False, iteration=steps)
+    version = np.bytes_(chain.versions["emcee"])
+    group.attrs.update(version=version, nwalkers=walkers, ndim=d, has_blobs=False, iteration=steps)
     for i, part in enumerate(state):
         group.attrs[f"random_state_{i}"] = part
-    group.create_dataset("chain", data=chain.chain[k], fletcher32=True)
-    group.create_dataset("log_prob", data=chain.log_prob[k], fletcher32=True)
-    group.create_dataset("accepted", data=chain.accepted[k].astype(np.float64), fletcher32=True)
+    for name, values in (("chain", chain.chain[k]), ("log_prob", chain.log_prob[k]), ("accepted", chain.accepted[k].astype(float))):
+        rows = math.ceil(len(values) / math.ceil(values.nbytes / LARGEST_CHUNK))  # equal parts, so that none is filled up
+        group.create_dataset(name, data=values, chunks=(rows, *values.shape[1:]), fletcher32=True)
 
 
-def _replace(path: Path, fill: Any) -> None:
-    """Write a file under a temporary name, flush it to the disk, and rename it over `path`."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def _replace(path: Path, content: memoryview) -> None:
+    """Write a file under a temporary name, flush it to the disk, and rename it over `path`.
+
+    There is one writer, so there is one temporary name; what a killed run left under it goes, and so does a link.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with h5py.File(temporary, "w") as file:
-            fill(file)
-        with open(temporary, "rb+") as stream:
+        temporary.unlink(missing_ok=True)
+        with open(temporary, "xb") as stream:
+            stream.write(content)
+            stream.write(seal(content))
+            stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
         folder = os.open(path.parent, os.O_RDONLY)
@@ -182,61 +198,61 @@ def _replace(path: Path, fill: Any) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror or error}), expected a disk with room and a folder that can be "
+                "written: what was saved before is still there, go on from it with resume"
+            ) from None
         raise
-
-
-def _open(path: Path) -> h5py.File:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a chain written by `bayesfred fit`: check the path")
-    try:
-        file = h5py.File(path, "r", locking=False)
-    except OSError as error:
-        raise InputError(f"{path}: not a readable HDF5 file ({error}), expected a chain written by `bayesfred fit`") from None
-    if file.attrs.get("kind") != KIND or file.attrs.get("schema") != SCHEMA:
-        got = f"{file.attrs.get('kind')!r} of schema {file.attrs.get('schema')}"
-        file.close()
-        raise InputError(f"{path}: got {got}, expected {KIND!r} of schema {SCHEMA}: remake it with this version")
-    return file
-
-
-def _reading(path: Path, read: Callable[[h5py.File], Read]) -> Read:
-    """What `read` makes of a chain file; a file that lacks something, or whose checksums do not hold, is refused."""
-    with _open(path) as file:
-        try:
-            return read(file)
-        except (KeyError, OSError, ValueError) as error:
-            raise InputError(f"{path}: damaged ({error}), expected a whole chain file: restore a copy, or run again") from None
 
 
 def _read(path: Path, file: h5py.File) -> Chain:
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
-    return Chain(
+    chain = Chain(
         path,
-        tuple(str(name) for name in file.attrs["parameter_names"]),
+        tuple(name.decode() for name in file.attrs["parameter_names"]),
         np.stack([g["chain"][()] for g in groups]),
         np.stack([g["log_prob"][()] for g in groups]),
         np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
         int(file.attrs["burn_in"]),
         int(file.attrs["seed"]),
         MapEstimate.read(file["estimate"]),
-        {str(k): str(v) for k, v in file["versions"].attrs.items()},
+        {name: version.decode() for name, version in file["versions"].attrs.items()},
         float(file.attrs["target_ess"]),
+        int(file.attrs["n_invalid"]),
     )
+    d, shape = len(chain.parameter_names), chain.chain.shape
+    arrays = (chain.chain, chain.log_prob, chain.accepted, chain.estimate.params, chain.estimate.covariance)
+    if [a.shape for a in arrays] != [(*shape[:3], d), shape[:3], (shape[0], shape[2]), (d,), (d, d)] or 0 in shape:
+        raise ValueError("shapes that do not agree")
+    if {int(g.attrs["iteration"]) for g in groups} != {shape[1]} or not 0 <= chain.burn_in < shape[1]:
+        raise ValueError("numbers of steps that do not agree")
+    return chain
+
+
+def _random_state(attributes: Any) -> tuple[Any, ...]:
+    """The state of a Mersenne twister, the one kind there is."""
+    key, position, has_gauss, gauss = (attributes[f"random_state_{i}"] for i in range(1, 5))
+    if key.shape != (624,) or not 0 <= position <= 624:
+        raise ValueError("no state of random numbers")
+    return "MT19937", key.astype(np.uint32), int(position), int(has_gauss), float(gauss)
 
 
 def _digest(item: Any) -> str:
     """SHA-256 over names, attributes and data of an HDF5 item and all it holds."""
     digest = hashlib.sha256()
 
+    def put(name: str, value: Any) -> None:
+        array = np.asarray(value)
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
+
     def add(name: str, node: Any) -> None:
-        digest.update(name.encode())
         for key in sorted(node.attrs):
-            value = np.asarray(node.attrs[key])
-            digest.update(key.encode() + (value.tobytes() if value.dtype != object else repr(value.tolist()).encode()))
-        if isinstance(node, h5py.Dataset):
-            digest.update(node[()].tobytes())
+            put(f"{name}@{key}", node.attrs[key])
+        put(name, node[()] if isinstance(node, h5py.Dataset) else ())
 
     add("", item)
     if isinstance(item, h5py.Group):

@@ -56,7 +56,8 @@ class MapEstimate:
         """Store the estimate in an HDF5 group."""
         group.create_dataset("params", data=self.params)
         group.create_dataset("covariance", data=self.covariance)
-        for name in ("log_prob", "converged", "n_evaluations", "message"):
+        group.attrs["message"] = np.bytes_(self.message.encode())
+        for name in ("log_prob", "converged", "n_evaluations"):
             group.attrs[name] = getattr(self, name)
 
     @classmethod
@@ -69,7 +70,7 @@ class MapEstimate:
             float(a["log_prob"]),
             bool(a["converged"]),
             int(a["n_evaluations"]),
-            str(a["message"]),
+            bytes(a["message"]).decode(),
         )
 
 

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 from emcee.moves import RedBlueMove
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.special import gammaln, logsumexp
 
+from bayesfred.errors import InputError
 from bayesfred.inference.estimate import MapEstimate, inverse
 from bayesfred.inference.posterior import Posterior
 
@@ -48,6 +49,11 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     weights : array_like, shape (k,), optional
         Shares of the approximations; they sum to 1.
 
+    Raises
+    ------
+    InputError
+        If the covariance is not a positive definite matrix of finite numbers.
+
     References
     ----------
     L. Tierney (1994), Annals of Statistics 22, 1701, Section 2.3.4 (independence chains). T. Hesterberg (1995),
@@ -65,7 +71,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
         self.means = np.atleast_2d(mean)
         d = self.means.shape[1]
-        self.lowers = np.array([cholesky(c, lower=True) for c in np.reshape(covariance, (-1, d, d))])
+        try:
+            self.lowers = np.array([cholesky(c, lower=True) for c in np.reshape(covariance, (-1, d, d))])
+        except (LinAlgError, ValueError):
+            raise InputError("estimate: got no positive definite covariance, expected the maximum's: see find_map") from None
         self.weights = np.asarray(weights, dtype=np.float64)
 
     @classmethod

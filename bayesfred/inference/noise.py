@@ -98,7 +98,7 @@ class PoissonNoise(Noise):
         return (counts - mean) / np.sqrt(mean + self.shift)
 
     def write(self, group: Any) -> None:
-        group.attrs["kind"] = "poisson"
+        group.attrs["kind"] = np.bytes_("poisson")
         group.attrs["read_noise"] = self.read_noise
 
 
@@ -139,12 +139,12 @@ class BackgroundNoise(Noise):
         return np.asarray((counts - mean) / np.sqrt(background))
 
     def write(self, group: Any) -> None:
-        group.attrs["kind"] = "background"
+        group.attrs["kind"] = np.bytes_("background")
 
 
 def read_noise_model(group: Any) -> PoissonNoise | BackgroundNoise:
     """The noise model stored in an HDF5 group."""
-    if group.attrs["kind"] == "background":
+    if group.attrs["kind"] == b"background":
         return BackgroundNoise()
     return PoissonNoise(float(group.attrs["read_noise"]))
 

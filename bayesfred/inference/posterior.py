@@ -128,14 +128,14 @@ class Nuisances:
         """Store the choices in an HDF5 group."""
         for f in fields(self):
             value = getattr(self, f.name)
-            group.attrs[f.name] = 0.0 if value is None else value
+            group.attrs[f.name] = 0.0 if value is None else np.bytes_(value) if isinstance(value, str) else value
 
     @classmethod
     def read(cls, group: Any) -> "Nuisances":
         """The choices stored in an HDF5 group by `write`."""
         a = group.attrs
         footprint = float(a["footprint"]) or None
-        flux: Any = str(a["flux"])
+        flux: Any = bytes(a["flux"]).decode()
         order, scatter = int(a["background_order"]), bool(a["position_scatter"])
         return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), order, footprint, scatter)
 
@@ -299,17 +299,21 @@ class Posterior:
         Returns
         -------
         float or ndarray, shape (n,)
-            -inf outside the prior's support.
+            -inf outside the prior's support, and where the arithmetic gives NaN or +inf.
 
         Raises
         ------
         InputError
             If a parameter vector has another length.
         """
-        vectors = self._vectors(params)
-        out = self.log_prior(vectors)
-        out[np.isnan(out)] = -np.inf
-        prior = out.copy()
+        values = self.unchecked_log_prob(self._vectors(params))
+        values[~(values < np.inf)] = -np.inf
+        return float(values[0]) if np.ndim(params) == 1 else values
+
+    def unchecked_log_prob(self, vectors: Floats) -> Floats:
+        """`log_prob` of vectors of shape (n, d) as the arithmetic gives it, with its NaN and +inf."""
+        prior = self.log_prior(vectors)
+        out = np.where(np.isnan(prior), -np.inf, prior)
         arguments = self._arguments(vectors)
         threads = min(numba.get_num_threads(), len(vectors))
 
@@ -324,8 +328,8 @@ class Posterior:
         else:
             list(_threads().map(evaluate, range(threads)))
         out += np.where(np.isfinite(out), prior + self._constant, 0.0)
-        out[np.isnan(out)] = -np.inf
-        return float(out[0]) if np.ndim(params) == 1 else out
+        out[np.isnan(prior)] = np.nan
+        return out
 
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d)."""

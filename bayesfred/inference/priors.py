@@ -127,7 +127,7 @@ def write(prior: Mapping[str, Any], group: Any) -> None:
     for name, distribution in prior.items():
         shapes, loc, scale = _standard(distribution)
         item = group.create_group(name)
-        item.attrs["family"] = distribution.dist.name
+        item.attrs["family"] = np.bytes_(distribution.dist.name)
         item.attrs["parameters"] = [*shapes, loc, scale]
 
 
@@ -135,7 +135,7 @@ def read(group: Any) -> dict[str, Any]:
     """The priors stored in an HDF5 group by `write`."""
     prior = {}
     for name in group:
-        family, values = str(group[name].attrs["family"]), [float(v) for v in group[name].attrs["parameters"]]
+        family, values = bytes(group[name].attrs["family"]).decode(), [float(v) for v in group[name].attrs["parameters"]]
         if family not in SLOPES:
             raise InputError(f"prior {name}: unknown family {family!r} in the file")
         prior[name] = getattr(stats, family)(*values[:-2], loc=values[-2], scale=values[-1])

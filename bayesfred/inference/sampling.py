@@ -9,14 +9,16 @@ half minute and at the end, so that a run that was stopped goes on where it was.
 import math
 import os
 import platform
+import signal
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import emcee
-import filelock
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
@@ -26,8 +28,9 @@ from threadpoolctl import threadpool_limits
 from bayesfred.errors import InputError
 from bayesfred.inference.chainfile import Chain, check_same_posterior, open_chain, random_states, write_chain
 from bayesfred.inference.convergence import convergence
+from bayesfred.inference.ensembles import Step, advance, begin, check_start
 from bayesfred.inference.estimate import MapEstimate, find_map
-from bayesfred.inference.moves import LaplaceMove
+from bayesfred.inference.lock import only_writer
 from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
@@ -36,8 +39,8 @@ RHAT = 1.01
 FIRST_CHECK = 8  # steps; fewer say nothing about autocorrelation
 GROWTH = 1.2  # of the number of steps between checks
 MOST_STEPS = 100_000
-DE_SHARE = 0.05  # of the steps move by differential evolution
-CHECKPOINT = 30.0  # seconds
+CHECKPOINT = 30.0  # seconds from one to the next, or more:
+CHECKPOINT_SHARE = 0.01  # of a run's time goes into them
 PACKAGES = ("bayesfred", "emcee", "numba", "numpy", "scipy")
 
 
@@ -61,7 +64,7 @@ def sample(
     ----------
     posterior : Posterior
     estimate : MapEstimate, optional
-        Found by `find_map` if not given.
+        Found by `find_map` if not given, once it is certain that no other process writes the file.
     path : path-like
         The chain file, HDF5.
     seed : int
@@ -89,7 +92,9 @@ def sample(
     ------
     InputError
         If the file exists (and neither `resume` nor `overwrite` is given), belongs to another posterior, or is being
-        written by another process; if the numbers of ensembles or walkers are too small.
+        written by another process, which is named, or cannot be written; if the numbers of ensembles or walkers are too small;
+        if the walkers have no posterior density to start from or do not spread in every direction, or if they are
+        stuck: what was sampled until then is saved.
     KeyboardInterrupt
         After everything up to the last complete step was saved.
 
@@ -101,16 +106,24 @@ def sample(
     _check_numbers(ensembles, walkers, target_ess, steps)
     if not path.parent.is_dir():
         raise InputError(f"{path}: no folder {path.parent}, expected one to write the chain to: create it")
-    if path.exists() and not (resume or overwrite):
-        raise InputError(f"{path}: exists, expected a new file: resume the run in it (resume), or replace it (overwrite)")
-    with _lock(path):
+    with only_writer(path):
+        if path.exists() and not (resume or overwrite):
+            raise InputError(f"{path}: exists, expected a new file: resume the run in it (resume), or replace it (overwrite)")
         if resume and path.exists():
             check_same_posterior(path, posterior)
             run = _Run.resumed(posterior, open_chain(path), random_states(path))
         else:
-            run = _Run.begun(posterior, estimate or find_map(posterior), path, seed, ensembles, walkers)
+            estimate = estimate or _find_map(posterior, progress)
+            run = _Run(posterior, estimate, path, seed, begin(posterior, estimate, seed, ensembles, walkers))
         with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin, and take half the likelihood's cores
             return run.until(target_ess, steps, progress)
+
+
+def _find_map(posterior: Posterior, progress: bool) -> MapEstimate:
+    if not progress:
+        return find_map(posterior)
+    with Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)"):
+        return find_map(posterior)
 
 
 def _check_numbers(ensembles: int, walkers: int, target_ess: float, steps: int | None) -> None:
@@ -122,18 +135,6 @@ def _check_numbers(ensembles: int, walkers: int, target_ess: float, steps: int |
         raise InputError(f"sampling: target_ess: got {target_ess}, expected a positive number of effective draws")
     if steps is not None and steps < 1:
         raise InputError(f"sampling: steps: got {steps}, expected at least 1")
-
-
-def _lock(path: Path) -> filelock.BaseFileLock:
-    """A lock on the chain file that says who holds it."""
-    lock = filelock.FileLock(path.with_name(f".{path.name}.lock"), timeout=1.0)
-    try:
-        lock.acquire()
-    except filelock.Timeout:
-        raise InputError(
-            f"{path}: another process is writing this chain, expected to be the only one: wait for it, or stop it"
-        ) from None
-    return lock
 
 
 def burn_in(chain: Floats) -> int:
@@ -155,64 +156,38 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
-class _Step(NamedTuple):
-    """All ensembles after a step."""
-
-    coords: Floats  # (ensembles, walkers, d)
-    log_prob: Floats  # (ensembles, walkers)
-    accepted: npt.NDArray[np.int64]  # (ensembles, walkers) moves accepted so far
-    random: list[tuple[Any, ...]]  # state of each ensemble's random numbers
-
-    @classmethod
-    def of(cls, states: list[emcee.State], accepted: npt.NDArray[np.int64]) -> "_Step":
-        """A copy of the ensembles' states."""
-        coords, log_prob = np.stack([s.coords for s in states]), np.stack([s.log_prob for s in states])
-        return cls(coords, log_prob, accepted, [s.random_state for s in states])
-
-    def states(self) -> list[emcee.State]:
-        """The ensembles for emcee to go on with."""
-        parts = zip(self.coords, self.log_prob, self.random, strict=True)
-        return [emcee.State(coords, log_prob=log_prob, random_state=random) for coords, log_prob, random in parts]
+@contextmanager
+def _unbroken() -> Iterator[None]:
+    """Keep Ctrl-C and termination waiting until what is inside is done; other threads never get them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    arrived: list[int] = []
+    before = {number: signal.signal(number, lambda n, _: arrived.append(n)) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+        if arrived:
+            signal.raise_signal(arrived[0])
 
 
 class _Run:
     """A run in progress: the steps so far and the ensembles that make more."""
 
-    def __init__(self, posterior: Posterior, estimate: MapEstimate, path: Path, seed: int, states: list[emcee.State]) -> None:
-        self.posterior, self.estimate, self.path, self.seed = posterior, estimate, path, seed
-        self.steps: list[_Step] = []
-        self.start = _Step.of(states, np.zeros((len(states), len(states[0].coords)), np.int64))
-
-    @classmethod
-    def begun(cls, posterior: Posterior, estimate: MapEstimate, path: Path, seed: int, ensembles: int, walkers: int) -> "_Run":
-        """Walkers at draws of the Laplace approximation that the prior admits."""
-        move = LaplaceMove.of(posterior, estimate)
-        states = []
-        for child in np.random.SeedSequence(seed).spawn(ensembles):
-            random = np.random.RandomState(np.random.MT19937(child))
-            coords, log_prob = np.empty((0, posterior.n_parameters)), np.empty(0)
-            for _ in range(100):
-                drawn = move.draw(walkers, random)
-                values = posterior.log_prob(drawn)
-                good = np.isfinite(values)
-                coords, log_prob = np.concatenate([coords, drawn[good]]), np.concatenate([log_prob, values[good]])
-                if len(coords) >= walkers:
-                    break
-            else:
-                raise InputError("estimate: the posterior has no density around it, expected its maximum: see find_map")
-            states.append(emcee.State(coords[:walkers], log_prob=log_prob[:walkers], random_state=random.get_state()))
-        return cls(posterior, estimate, path, seed, states)
+    def __init__(self, posterior: Posterior, estimate: MapEstimate, path: Path, seed: int, start: Step) -> None:
+        check_start(posterior.parameter_names, start)
+        self.posterior, self.estimate, self.path, self.seed, self.start = posterior, estimate, path, seed, start
+        self.steps: list[Step] = []
 
     @classmethod
     def resumed(cls, posterior: Posterior, chain: Chain, random: list[tuple[Any, ...]]) -> "_Run":
         """The run in a chain file, after its last step."""
-        states = [
-            emcee.State(chain.chain[k, -1], log_prob=chain.log_prob[k, -1], random_state=state)
-            for k, state in enumerate(random)
-        ]
-        run = cls(posterior, chain.estimate, chain.path, chain.seed, states)
         positions = zip(chain.chain.swapaxes(0, 1), chain.log_prob.swapaxes(0, 1), strict=True)
-        run.steps = [_Step(coords, log_prob, chain.accepted, random) for coords, log_prob in positions]
+        steps = [Step(coords, log_prob, chain.accepted, random, chain.n_invalid) for coords, log_prob in positions]
+        run = cls(posterior, chain.estimate, chain.path, chain.seed, steps[-1])
+        run.steps = steps
         return run
 
     def until(self, target_ess: float, steps: int | None, progress: bool) -> Chain:
@@ -220,15 +195,14 @@ class _Run:
         check = FIRST_CHECK
         while steps is None and check < len(self.steps):  # the checks fall on the same steps in a resumed run
             check = math.ceil(check * GROWTH)
-        saved = time.monotonic()
+        due = time.monotonic() + CHECKPOINT
         state = TextColumn("{task.fields[state]}")
         columns = (TextColumn("sampling"), BarColumn(), state, TimeElapsedColumn(), TimeRemainingColumn())
         with Progress(*columns, console=Console(stderr=True), disable=not progress) as bar:
             task = bar.add_task("", total=steps, completed=len(self.steps), state="")
             try:
-                if steps is None and self.steps and self._enough(target_ess)[0]:
-                    return self.chain(target_ess)
-                for _ in self._advance(MOST_STEPS if steps is None else steps):
+                enough = steps is None and bool(self.steps) and self._enough(target_ess)[0]
+                for _ in self._advance(0 if enough else MOST_STEPS if steps is None else steps):
                     n = len(self.steps)
                     bar.update(task, completed=n, state=f"{n} steps")
                     if steps is None and n >= check:
@@ -237,32 +211,25 @@ class _Run:
                             break
                         bar.update(task, total=max(n + 1, math.ceil(n / max(share, 0.05))))
                         check = math.ceil(check * GROWTH)
-                    if time.monotonic() - saved > CHECKPOINT:
-                        self._save(target_ess)
-                        saved = time.monotonic()
-            finally:
+                    if time.monotonic() >= due:
+                        began = time.monotonic()
+                        self._save(self._unfinished(target_ess))
+                        now = time.monotonic()
+                        due = now + max(CHECKPOINT, (now - began) / CHECKPOINT_SHARE)
+                chain = self._unfinished(target_ess)
+                chain = replace(chain, burn_in=burn_in(chain.chain))
+                self._save(chain)
+                return chain
+            except BaseException:
                 if self.steps:
-                    self._save(target_ess)
-        return self.chain(target_ess)
+                    self._save(self._unfinished(target_ess))
+                raise
 
     def _advance(self, total: int) -> Iterator[None]:
-        """Step all ensembles in turn; a step counts when every ensemble has made it."""
-        moves = [
-            (LaplaceMove.of(self.posterior, self.estimate), 1.0 - DE_SHARE),
-            (emcee.moves.DEMove(live_dangerously=True), DE_SHARE),
-        ]
-        last = self.steps[-1] if self.steps else self.start
-        _, walkers, d = last.coords.shape
-        generators = []
-        for state in last.states():
-            sampler = emcee.EnsembleSampler(walkers, d, self.posterior.log_prob, moves=moves, vectorize=True)
-            sampler.log_prob_fn = self.posterior.log_prob  # emcee's wrapper would print a traceback when interrupted
-            generators.append(sampler.sample(state, iterations=None, store=False, skip_initial_state_check=True))
+        """Make steps until there are so many."""
+        steps = advance(self.posterior, self.estimate, self.steps[-1] if self.steps else self.start)
         while len(self.steps) < total:
-            states = [next(generator) for generator in generators]
-            moved = np.stack([np.any(state.coords != before, axis=1) for state, before in zip(states, last.coords, strict=True)])
-            last = _Step.of(states, last.accepted + moved)
-            self.steps.append(last)  # all of a step or nothing, wherever an interrupt comes
+            self.steps.append(next(steps))  # all of a step or nothing, wherever an interrupt comes
             yield
 
     def _enough(self, target_ess: float) -> tuple[bool, float]:
@@ -272,22 +239,25 @@ class _Run:
         share = float(min(bulk.min(), tail.min()) / target_ess)
         return bool(share >= 1.0 and rhat.max() <= RHAT), share
 
-    def chain(self, target_ess: float) -> Chain:
-        """The run so far."""
+    def _unfinished(self, target_ess: float) -> Chain:
+        """The run so far, with the most burn-in there can be, because finding the right one takes longer than to save it."""
         steps = list(self.steps)
         chain = np.stack([step.coords for step in steps], axis=1)
+        log_prob = np.stack([step.log_prob for step in steps], axis=1)
         return Chain(
             self.path,
             self.posterior.parameter_names,
             chain,
-            np.stack([step.log_prob for step in steps], axis=1),
+            log_prob,
             steps[-1].accepted,
-            burn_in(chain),
+            len(steps) // 2,
             self.seed,
             self.estimate,
             versions(),
             target_ess,
+            steps[-1].n_invalid,
         )
 
-    def _save(self, target_ess: float) -> None:
-        write_chain(self.chain(target_ess), self.posterior, self.steps[-1].random)
+    def _save(self, chain: Chain) -> None:
+        with _unbroken():
+            write_chain(chain, self.posterior, self.steps[-1].random)
