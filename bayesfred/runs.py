@@ -3,9 +3,12 @@
 `cli.py` is the same from a shell. Settings become objects here, and nowhere else.
 """
 
+import io
+import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +19,7 @@ from rich.table import Table
 
 from bayesfred import files, settings
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
-from bayesfred.errors import InputError
+from bayesfred.errors import InputError, printable
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
@@ -38,6 +41,11 @@ DEMO_NOTE = (
     "coefficients are those of its Table 2, read with g in y and the columns in the order u2x, v2x, ux, vx, ux2, vx2: the "
     "reading in which the paper's results are possible."
 )
+
+
+# Share of the frame's half-width by which images may stand away from their sources: three standard deviations of a term's default
+# prior. Sources whose light is farther from the frame than that are left out.
+STRAY = 0.3
 
 
 @dataclass(frozen=True)
@@ -109,16 +117,18 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
         )
     posterior, _ = _simulated(run, Path(run_file), run.simulation.seed)
     # written beside the run file, whatever lies in the data folder
-    frame, catalogue = Path(run_file).parent / run.frame.path, Path(run_file).parent / run.catalogue.path
-    if frame.exists() and not overwrite:  # before the catalogue is written
+    folder = Path(run_file).parent
+    frame = settings.within(folder, run.frame.path, f"{run_file}: frame.path")
+    catalogue = settings.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
+    if os.path.lexists(frame) and not overwrite:  # before the catalogue is written
         raise InputError(f"{frame}: exists, expected a new file: rename it, or replace it with --overwrite")
     if run.simulation.grid is not None:
         s = posterior.model.sources
         files.write_catalogue(catalogue, files.CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite)
-        print(f"{catalogue}: {len(s)} sources")
+        print(f"{printable(str(catalogue))}: {len(s)} sources")
     files.write_frame(frame, posterior.counts, overwrite=overwrite)
     ny, nx = posterior.counts.shape
-    print(f"{frame}: {ny} x {nx} pixels, {posterior.counts.sum():.0f} counts")
+    print(f"{printable(str(frame))}: {ny} x {nx} pixels, {posterior.counts.sum():.0f} counts")
 
 
 def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) -> Result:
@@ -144,21 +154,25 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
+    output = _output(run, run_file)
     f = run.frame
-    frame = files.read_frame(
-        settings.resolve(f.path, run_file, must_exist=True), gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
-    )
+    path = settings.resolve(f.path, run_file, must_exist=True)
+    if os.path.exists(output) and output.samefile(path):
+        raise InputError(f"{run_file}: output.path: got the frame's file, expected another: the chain would replace the frame")
+    frame = files.read_frame(path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name)
     print(frame.description)
     ny, nx = frame.counts.shape
-    sources = _sources(run, run_file)
+    sources, census = _sources(run, run_file, (ny, nx))
+    print(census)
     try:
         posterior = _posterior(run, _model(run, (ny, nx), sources), frame.counts, frame.valid)
     except InputError as error:
         raise InputError(f"{run_file}: {error}") from None
-    output = Path(run.output.path) if run.output.path else Path("chains") / f"{run_file.stem}.h5"
-    if run.output.path is None:
-        output.parent.mkdir(exist_ok=True)
-    return _fit(posterior, output, run, run_file.stem, [frame.description], resume=resume, overwrite=overwrite)
+    if run.output.path is None and not output.parent.is_dir():
+        with _writing(output):
+            output.parent.mkdir()
+    notes = [frame.description, census]
+    return _fit(posterior, output, run, run_file.stem, notes, resume=resume, overwrite=overwrite)
 
 
 def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
@@ -173,8 +187,15 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
     Returns
     -------
     Result
+
+    Raises
+    ------
+    InputError
+        If the chain is missing, damaged, or named as its page or picture would be.
     """
     chain = open_chain(chain_file)
+    if chain.path in _beside(chain.path):
+        raise InputError(f"{chain_file}: got a chain named as its report, which would replace it, expected NAME.h5: rename it")
     return _report(chain, chain.posterior(), Path(chain_file).stem, [], target_ess=target_ess or chain.target_ess)
 
 
@@ -182,7 +203,11 @@ def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Po
     """A simulated frame's posterior and the true parameters."""
     s = run.simulation
     assert s is not None, "checked by the callers"
-    sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux) if s.grid else _sources(run, run_file)
+    files.require_memory(f"{run_file}: simulation.shape", s.shape)
+    if s.grid:
+        sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)
+    else:
+        sources, _ = _sources(run, run_file, s.shape)
     model = _model(run, s.shape, sources)
     unknown = sorted(set(s.theta) - set(model.distortion.names))
     if unknown:
@@ -201,11 +226,45 @@ def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Po
     return posterior, truth
 
 
-def _sources(run: settings.RunSettings, run_file: Path) -> SourceCatalog:
+def _output(run: settings.RunSettings, run_file: Path) -> Path:
+    """Where the chain goes: inside the folder that the run is started in, whatever a run file from elsewhere says."""
+    return settings.within(".", run.output.path or Path("chains", f"{run_file.stem}.h5"), f"{run_file}: output.path")
+
+
+def _beside(chain: Path) -> tuple[Path, Path]:
+    """Page and picture of a chain file."""
+    return chain.with_suffix(".html"), chain.with_suffix(".png")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what a disk or a file system refuses into one line."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}), expected room and a folder that can be") from error
+
+
+def _sources(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) -> tuple[SourceCatalog, str]:
+    """The catalogue's sources whose light can reach the frame, and a line that counts them.
+
+    A source is at the edge if its light, were nothing distorted, would fall in part outside the frame; and outside if it
+    stays outside even for an image that stands `STRAY` away. If all are outside, all are kept: the posterior says so.
+    """
     c = run.catalogue
     path = settings.resolve(c.path, run_file, must_exist=True)
     record = files.read_catalogue(path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point)
-    return SourceCatalog(record.x, record.y, record.flux)
+    half = 0.5 * run.detector.binning * np.array(shape)[::-1]
+    tolerance = run.model.tolerance
+    reach = run.psf.sigma * math.sqrt(-2.0 * math.log(tolerance)) if tolerance > 0 else math.inf
+    beyond = np.abs([record.x, record.y]) - half[:, None]  # pixels, negative inside
+    outside = (beyond > reach + STRAY * half[:, None]).any(axis=0)
+    kept = ~outside if not outside.all() else outside
+    at_edge = kept & (beyond > -reach).any(axis=0)
+    n, n_kept, n_edge = len(record.x), kept.sum(), at_edge.sum()
+    census = f"{printable(path.name)}: {n} sources, {n_edge} at the frame's edge, {n - n_kept} outside left out"
+    return SourceCatalog(record.x[kept], record.y[kept], record.flux[kept]), census
 
 
 def _model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog) -> ForwardModel:
@@ -253,17 +312,25 @@ def _fit(
         raise InputError("--resume and --overwrite: got both, expected one: go on with the run, or replace it")
     if not output.parent.is_dir():
         raise InputError(f"{output}: no folder {output.parent}, expected one to write the chain to: create it")
-    if output.exists() and not (overwrite or resume):  # said before the work, not after it
-        raise InputError(f"{output}: exists, expected a new file: go on with --resume, or replace it with --overwrite")
+    page, picture = _beside(output)
+    for path in (output, page, picture, output.with_name(f".{output.name}.lock")):
+        if os.path.islink(path) or os.path.isdir(path):
+            raise InputError(f"{path}: got a link or a folder, expected a file or nothing there: remove it, or write elsewhere")
+    resume = resume and os.path.exists(output)
+    for path in (output, page, picture):  # said before the work, not after it
+        if os.path.exists(path) and not (overwrite or resume):
+            remedy = "go on with --resume, or replace it with --overwrite" if path == output else "move it, or use --overwrite"
+            raise InputError(f"{path}: exists, expected a new file: {remedy}")
     estimate = None
-    if not (resume and output.exists()):
+    if not resume:
         with Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)"):
             estimate = find_map(posterior)
         print(f"maximum: {estimate.message}")
-    chain = sample(
-        posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
-        target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
-    )  # fmt: skip
+    with _writing(output):
+        chain = sample(
+            posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
+            target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
+        )  # fmt: skip
     return _report(chain, posterior, title, notes, target_ess=s.target_ess, truth=truth, run=run)
 
 
@@ -281,18 +348,23 @@ def _report(
     diagnostics = diagnose(chain, target_ess=target_ess)
     # a file or a pipe has no width of its own
     Console(width=None if sys.stdout.isatty() else 120).print(_table(chain, diagnostics, truth))
-    page = html.write_report(
-        chain.path.with_suffix(".html"), title=title, chain=chain, diagnostics=diagnostics, posterior=posterior, truth=truth,
-        notes=notes, settings=run.model_dump_json(indent=2) if run else None,
-    )  # fmt: skip
-    picture = chain.path.with_suffix(".png")
+    page, picture = _beside(chain.path)
+    with _writing(page):
+        html.write_report(
+            page, title=printable(title), chain=chain, diagnostics=diagnostics, posterior=posterior, truth=truth, notes=notes,
+            settings=run.model_dump_json(indent=2) if run else None,
+        )  # fmt: skip
     expected = posterior.expected_counts(chain.estimate.params)
     sigma = posterior.sigma(chain.estimate.params)
     figure = plots.overview(
         posterior.counts, expected, sigma, posterior.mask, chain.draws(), chain.parameter_names, truth=truth
     )
-    figure.savefig(picture, dpi=150)
-    print(f"{diagnostics.message}\nchain   {chain.path}\nreport  {page}\npicture {picture}")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=150)
+    files.write_bytes(picture, buffer.getvalue(), overwrite=True)
+    print(diagnostics.message)
+    for label, path in (("chain", chain.path), ("report", page), ("picture", picture)):
+        print(f"{label:8}{printable(str(path))}")
     return Result(chain, diagnostics)
 
 
