@@ -91,7 +91,7 @@ def demo(folder: PathLike, *, seed: int = 1, overwrite: bool = False) -> Result:
     run = settings.read_settings(example)
     run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
     posterior, truth = _simulated(run, example, seed)
-    return _fit(posterior, Path(folder) / "demo.h5", run, "demo", [DEMO_NOTE], truth=truth, overwrite=overwrite)
+    return _fit(posterior, Path(folder) / "demo.h5", run, Path("demo"), [DEMO_NOTE], truth=truth, overwrite=overwrite)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
@@ -164,15 +164,13 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     ny, nx = frame.counts.shape
     sources, census = _sources(run, run_file, (ny, nx))
     print(census)
-    try:
+    with _naming(run_file):
         posterior = _posterior(run, _model(run, (ny, nx), sources), frame.counts, frame.valid)
-    except InputError as error:
-        raise InputError(f"{run_file}: {error}") from None
     if run.output.path is None and not output.parent.is_dir():
         with _writing(output):
             output.parent.mkdir()
     notes = [frame.description, census]
-    return _fit(posterior, output, run, run_file.stem, notes, resume=resume, overwrite=overwrite)
+    return _fit(posterior, output, run, run_file, notes, resume=resume, overwrite=overwrite)
 
 
 def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
@@ -234,6 +232,15 @@ def _output(run: settings.RunSettings, run_file: Path) -> Path:
 def _beside(chain: Path) -> tuple[Path, Path]:
     """Page and picture of a chain file."""
     return chain.with_suffix(".html"), chain.with_suffix(".png")
+
+
+@contextmanager
+def _naming(run_file: Path) -> Iterator[None]:
+    """Begin the line of what the objects of a run refuse with the file that describes them."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{run_file}: {error}") from None
 
 
 @contextmanager
@@ -299,7 +306,7 @@ def _fit(
     posterior: Posterior,
     output: Path,
     run: settings.RunSettings,
-    title: str,
+    run_file: Path,
     notes: Sequence[str],
     *,
     truth: Floats | None = None,
@@ -323,7 +330,8 @@ def _fit(
             raise InputError(f"{path}: exists, expected a new file: {remedy}")
     estimate = None
     if not resume:
-        with Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)"):
+        status = Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)")
+        with status, _naming(run_file):
             estimate = find_map(posterior)
         print(f"maximum: {estimate.message}")
     with _writing(output):
@@ -331,7 +339,7 @@ def _fit(
             posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
             target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
         )  # fmt: skip
-    return _report(chain, posterior, title, notes, target_ess=s.target_ess, truth=truth, run=run)
+    return _report(chain, posterior, run_file.stem, notes, target_ess=s.target_ess, truth=truth, run=run)
 
 
 def _report(
