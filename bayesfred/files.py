@@ -395,6 +395,13 @@ def _require_image(path: Path, shape: tuple[int, ...] | None, dtype: np.dtype[An
         raise InputError(f"{where}: got values of type {dtype}, expected real numbers")
 
 
+class _Stream(io.BufferedReader):
+    """A file in which a seek beyond the end, as absurd headers ask for, goes to the end."""
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        return super().seek(min(offset, os.fstat(self.fileno()).st_size), whence)
+
+
 def _read_fits(path: Path, name: str | None) -> NDArray[np.float64]:
     seen = []
     with _readable(path, "FITS"), warnings.catch_warnings():
@@ -402,7 +409,7 @@ def _read_fits(path: Path, name: str | None) -> NDArray[np.float64]:
         warnings.simplefilter("ignore", AstropyWarning)
         zipped = path.suffix.lower() == ".gz"
         # uint=False: as unsigned integers BLANK pixels would come through as ordinary numbers.
-        with gzip.open(path) if zipped else path.open("rb") as stream, fits.open(stream, memmap=False, uint=False) as hdus:
+        with gzip.open(path) if zipped else _Stream(io.FileIO(path)) as stream, fits.open(stream, memmap=False, uint=False) as hdus:
             for index, hdu in enumerate(hdus):
                 if not hdu.is_image:
                     continue

@@ -256,8 +256,8 @@ def _writing(path: Path) -> Iterator[None]:
 def _sources(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) -> tuple[SourceCatalog, str]:
     """The catalogue's sources whose light can reach the frame, and a line that counts them.
 
-    A source is at the edge if its light, were nothing distorted, would fall in part outside the frame; and outside if it
-    stays outside even for an image that stands `STRAY` away. If all are outside, all are kept: the posterior says so.
+    A source is at the edge if the frame's border is within three widths of the PSF, or between it and the frame; and outside if
+    no light reaches the frame from an image that stands `STRAY` nearer. If all are outside, all are kept: the posterior says so.
     """
     c = run.catalogue
     path = settings.resolve(c.path, run_file, must_exist=True)
@@ -268,7 +268,7 @@ def _sources(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) 
     beyond = np.abs([record.x, record.y]) - half[:, None]  # pixels, negative inside
     outside = (beyond > reach + STRAY * half[:, None]).any(axis=0)
     kept = ~outside if not outside.all() else outside
-    at_edge = kept & (beyond > -reach).any(axis=0)
+    at_edge = kept & (beyond > -3.0 * run.psf.sigma).any(axis=0)
     n, n_kept, n_edge = len(record.x), kept.sum(), at_edge.sum()
     census = f"{printable(path.name)}: {n} sources, {n_edge} at the frame's edge, {n - n_kept} outside left out"
     return SourceCatalog(record.x[kept], record.y[kept], record.flux[kept]), census

@@ -341,10 +341,45 @@ def spoil_pixel(value: float) -> Prepare:
     return prepare
 
 
+def cut_frame(size: int) -> Prepare:
+    """Keep the first bytes of the frame."""
+    return lambda folder: (folder / "frame.fits").write_bytes((folder / "frame.fits").read_bytes()[:size])
+
+
+def claim(columns: int, rows: int) -> Prepare:
+    """Let the frame's header claim a size; the data stay."""
+
+    def prepare(folder: Path) -> None:
+        content = (folder / "frame.fits").read_bytes()
+        for card, value in ((b"NAXIS1  =", columns), (b"NAXIS2  =", rows)):
+            start = content.index(card)
+            content = content[:start] + card + f"{value:>21}".encode() + content[start + 30 :]
+        (folder / "frame.fits").write_bytes(content)
+
+    return prepare
+
+
+def link(name: str, target: str) -> Prepare:
+    return lambda folder: (folder / name).symlink_to(folder / target)
+
+
+def both(*steps: Prepare) -> Prepare:
+    def prepare(folder: Path) -> None:
+        for step in steps:
+            step(folder)
+
+    return prepare
+
+
 def frame_without_image(folder: Path) -> None:
     """A FITS file of one header: 36 cards of 80 characters, and no data."""
     cards = ("SIMPLE  =                    T", "BITPIX  =                    8", "NAXIS   =                    0", "END")
     (folder / "frame.fits").write_bytes("".join(card.ljust(80) for card in cards).ljust(2880).encode())
+
+
+def frame_in_hdf5(folder: Path) -> None:
+    """Put the frame where the chain would go."""
+    files.write_frame(folder / "run.h5", files.read_frame(folder / "frame.fits").counts)
 
 
 def unchanged(folder: Path) -> None:
@@ -362,7 +397,9 @@ class Refusal:
 
 
 SIMULATE = ("simulate", "run.toml", "--overwrite")
+OVERWRITE = ("fit", "run.toml", "--overwrite")
 MIRRORED = 'terms = "mirrored"'
+FOLDED = 'distribution = "uniform"\nloc = -0.3\nscale = 0.1'
 ON_AXIS = "f_terms = [[1, 0, 1, 0]]\ng_terms = [[0, 0, 2, 0]]"
 
 REFUSALS = [
@@ -371,15 +408,38 @@ REFUSALS = [
     Refusal("unknown key", sections(frame='path = "frame.fits"\ngian = 2.0'), ("run.toml", "frame.gian", "'gain'")),
     Refusal("missing frame", without("frame.fits"), ("run.toml", "frame.fits", "BAYESFRED_DATA")),
     Refusal("not a FITS", content("frame.fits", "no FITS at all"), ("frame.fits", "FITS")),
+    Refusal("truncated FITS", cut_frame(20_000), ("frame.fits", "FITS")),
+    Refusal("truncated header", cut_frame(1000), ("frame.fits", "FITS")),
+    Refusal("empty FITS", cut_frame(0), ("frame.fits", "FITS")),
+    Refusal("absurd NAXIS", claim(10**9, 10**9), ("frame.fits", "1000000000 x 1000000000 pixels", "GB of memory", "bin")),
+    Refusal("more than memory", claim(10**6, 10**5), ("frame.fits", "100000 x 1000000 pixels", "GB of memory", "bin")),
+    Refusal("negative NAXIS", claim(-75, 60), ("frame.fits",)),
     Refusal("no image", frame_without_image, ("frame.fits", "2-D image")),
     Refusal("negative counts", spoil_pixel(-3.0), ("frame.fits", "-3", "row 5, column 7", "gain")),
     Refusal("part of a count", spoil_pixel(1.5), ("frame.fits", "1.5", "row 5, column 7", "gain")),
+    Refusal("more than float64 counts", spoil_pixel(1e300), ("frame.fits", "1e+300", "row 5, column 7", "at most 9e+15")),
+    Refusal("nested TOML", content("run.toml", f"deep = {'[' * 20_000}{']' * 20_000}"), ("run.toml", "nested too deeply")),
+    Refusal("nan in TOML", sections(psf="sigma = nan"), ("run.toml", "psf.sigma", "nan", "finite")),
+    Refusal("inf in TOML", sections(model="tolerance = -inf"), ("run.toml", "model.tolerance", "inf", "finite")),
+    Refusal("text for a number", sections(psf='sigma = "2.5"'), ("run.toml", "psf.sigma", "'2.5'", "number")),
+    Refusal("number for a text", sections(frame="path = 7"), ("run.toml", "frame.path", "7", "string")),
+    Refusal("date for a text", sections(frame="path = 2000-01-01"), ("run.toml", "frame.path", "2000-01-01", "string")),
+    Refusal("array for a table", content("run.toml", "frame = [1]"), ("run.toml", "frame", "[1]", "table")),
+    Refusal("duplicate sources", content("stars.csv", "x,y,flux\n1,2,9\n3,4,9\n1,2,8\n"), ("stars.csv", "row 3", "(1, 2)", "row 1")),
+    Refusal("negative flux", content("stars.csv", "x,y,flux\n1,2,-9\n"), ("stars.csv", "row 1", "'flux'", "-9", "positive")),
+    Refusal("nan position", content("stars.csv", "x,y,flux\nnan,2,9\n"), ("stars.csv", "row 1", "'x'", "nan", "finite")),
     Refusal("missing catalogue", without("stars.csv"), ("run.toml", "stars.csv", "BAYESFRED_DATA")),
     Refusal("missing column", content("stars.csv", "x,y,light\n0,0,1\n"), ("stars.csv", "'flux'", "'light'")),
     Refusal("empty catalogue", content("stars.csv", "x,y,flux\n"), ("stars.csv", "empty")),
     Refusal("catalogue of no bytes", content("stars.csv", ""), ("stars.csv", "empty")),
     Refusal("output exists", content("run.h5", "precious"), ("run.h5", "exists", "--resume", "--overwrite")),
+    Refusal("page exists", content("run.html", "precious"), ("run.html", "exists", "--overwrite")),
+    Refusal("picture exists", content("run.png", "precious"), ("run.png", "exists", "--overwrite")),
+    Refusal("output is a folder", lambda folder: (folder / "run.h5").mkdir(), ("run.h5", "folder", "remove"), OVERWRITE),
+    Refusal("output is the frame", both(frame_in_hdf5, sections(frame='path = "run.h5"')), ("run.toml", "output.path", "frame"), OVERWRITE),
     Refusal("missing output folder", sections(output='path = "absent/run.h5"'), ("run.h5", "no folder absent")),
+    Refusal("simulated frame too large", sections(simulation="shape = [1000000, 1000000]\nbackground = 1"), ("run.toml", "GB"), SIMULATE),
+    Refusal("folded map", sections(**{"simulation.theta": "f_ux = -0.2"}), ("run.toml", "simulation.theta", "folds"), SIMULATE),
     Refusal("no simulation", content("run.toml", run_text().split("[simulation]")[0]), ("run.toml", "simulation"), SIMULATE),
     Refusal("unknown true term", sections(**{"simulation.theta": "f_zz = 1"}), ("run.toml", "simulation.theta", "f_zz"), SIMULATE),
     Refusal("simulated files exist", unchanged, ("exists", "--overwrite"), ("simulate", "run.toml")),
@@ -393,6 +453,8 @@ DESCRIBED = [
     Refusal("term on the axis", sections(distortion=ON_AXIS), ("g_terms", "g_u2", "i + j >= 1")),
     Refusal("narrow PSF", sections(psf="sigma = 0.3"), ("psf", "sigma", "0.3", "impulse", "box")),
     Refusal("prior of nothing", sections(**{"prior.f_zz": 'distribution = "norm"'}), ("prior", "f_zz", "g_vy")),
+    Refusal("folds alone", sections(**{"prior.f_ux": FOLDED}), ("run.toml", "no density", "fold")),
+    Refusal("pixels wider than the PSF", sections(psf="sigma = 1e-4", detector='pixel = "box"'), ("psf", "sigma", "1e+04", "box")),
     Refusal("unknown distribution", sections(**{"prior.f_ux": 'distribution = "nrm"'}), ("prior.f_ux", "distribution", "'nrm'")),
     Refusal("prior's keyword", sections(**{"prior.f_ux": 'distribution = "norm"\nsd = 1'}), ("prior.f_ux", "norm", "sd")),
 ]
@@ -422,7 +484,7 @@ def check_refusal(refusal: Refusal, folder: Path) -> Output:
 
 def names_a_file(output: Output) -> bool:
     """Whether the line begins with the file that has to be mended."""
-    return re.match(r"bayesfred: [^:]*\.(toml|fits|csv|h5): ", output.stderr) is not None
+    return re.match(r"bayesfred: [^:]*\.(toml|fits|csv|h5|html|png): ", output.stderr) is not None
 
 
 @pytest.mark.parametrize("refusal", by_name(REFUSALS))
