@@ -289,6 +289,18 @@ def test_star_panels_show_at_most_24_and_survive_none() -> None:
     assert "no source" in none.texts[0].get_text()
 
 
+@pytest.mark.parametrize("shape", [(1, 4000), (4000, 1), (1, 1)])
+def test_strips_of_a_frame_make_pictures_of_a_usual_size(shape: tuple[int, int]) -> None:
+    frame = np.full(shape, 4.0)
+    draws = np.random.default_rng(5).normal(size=(100, 2))
+    for figure in (
+        plots.frame_triptych(frame, frame, frame**0.5, frame > 0),
+        plots.overview(frame, frame, frame**0.5, frame > 0, draws, ("f_ux", "background")),
+    ):
+        height, width, _ = pixels(figure).shape
+        assert 0.1 < height / width < 1.2
+
+
 @pytest.mark.parametrize("with_truth", [True, False])
 def test_overview_shows_frame_and_marginals(with_truth: bool) -> None:
     chain, posterior = run()
