@@ -169,8 +169,7 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     if run.output.path is None and not output.parent.is_dir():
         with _writing(output):
             output.parent.mkdir()
-    notes = [frame.description, census]
-    return _fit(posterior, output, run, run_file, notes, resume=resume, overwrite=overwrite)
+    return _fit(posterior, output, run, run_file, [frame.description, census], resume=resume, overwrite=overwrite)
 
 
 def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
@@ -249,8 +248,7 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"{path}: cannot be written ({reason}), expected room and a folder that can be") from error
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}), expected room and a folder that can be") from error
 
 
 def _sources(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) -> tuple[SourceCatalog, str]:
@@ -259,19 +257,17 @@ def _sources(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) 
     A source is at the edge if the frame's border is within three widths of the PSF, or between it and the frame; and outside if
     no light reaches the frame from an image that stands `STRAY` nearer. If all are outside, all are kept: the posterior says so.
     """
-    c = run.catalogue
-    path = settings.resolve(c.path, run_file, must_exist=True)
+    c, path = run.catalogue, settings.resolve(run.catalogue.path, run_file, must_exist=True)
     record = files.read_catalogue(path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point)
-    half = 0.5 * run.detector.binning * np.array(shape)[::-1]
+    half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
     tolerance = run.model.tolerance
     reach = run.psf.sigma * math.sqrt(-2.0 * math.log(tolerance)) if tolerance > 0 else math.inf
-    beyond = np.abs([record.x, record.y]) - half[:, None]  # pixels, negative inside
-    outside = (beyond > reach + STRAY * half[:, None]).any(axis=0)
+    beyond = np.abs([record.x, record.y]) - half  # pixels, negative inside
+    outside = (beyond > reach + STRAY * half).any(axis=0)
     kept = ~outside if not outside.all() else outside
     at_edge = kept & (beyond > -3.0 * run.psf.sigma).any(axis=0)
-    n, n_kept, n_edge = len(record.x), kept.sum(), at_edge.sum()
-    census = f"{printable(path.name)}: {n} sources, {n_edge} at the frame's edge, {n - n_kept} outside left out"
-    return SourceCatalog(record.x[kept], record.y[kept], record.flux[kept]), census
+    numbers = f"{len(record.x)} sources, {at_edge.sum()} at the frame's edge, {(~kept).sum()} outside left out"
+    return SourceCatalog(record.x[kept], record.y[kept], record.flux[kept]), f"{printable(path.name)}: {numbers}"
 
 
 def _model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog) -> ForwardModel:

@@ -322,7 +322,8 @@ def star_panels(
 
 def _triptych_height(counts: Floats) -> float:
     """Inches that three frames side by side need; a strip of a frame gets a band around it."""
-    return TRIPTYCH_MARGIN + TRIPTYCH_SIDE * min(max(counts.shape[0] / counts.shape[1], 0.25), 2.0)
+    ny, nx = counts.shape
+    return TRIPTYCH_MARGIN + TRIPTYCH_SIDE * min(max(float(ny / nx), 0.25), 2.0)
 
 
 def overview(
