@@ -248,7 +248,8 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}), expected room and a folder that can be") from error
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}), expected room and a folder that can be") from error
 
 
 def _sources(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) -> tuple[SourceCatalog, str]:
