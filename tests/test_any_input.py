@@ -13,6 +13,7 @@ from datetime import date
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import h5py
 import numpy as np
@@ -21,6 +22,7 @@ from astropy.io import fits
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
@@ -258,6 +260,9 @@ def inputs(draw: DrawFn) -> Files:
     return files
 
 
+DRAWN = st.sampled_from([True, False, False, False])
+
+
 def snapshot(folder: Path) -> dict[str, bytes | None]:
     return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in sorted(folder.rglob("*"))}
 
@@ -276,8 +281,8 @@ def is_short(run_file: Path) -> bool:
     )  # fmt: skip
 
 
-def check(files: Files) -> None:
-    """Fit a folder of these files, beside a folder that is nobody's business."""
+def check(files: Files, drawn: bool) -> None:
+    """Fit a folder of these files, beside a folder that is nobody's business; pictures, most of the time, are drawn or not."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name).resolve()
         precious, here = root / "precious", root / "here"
@@ -291,7 +296,8 @@ def check(files: Files) -> None:
             (here / path).write_bytes(content.replace(b"{root}", bytes(precious)))
         assume(is_short(here / "run.toml"))
         before = snapshot(root)
-        with contextlib.chdir(here), warnings.catch_warnings(record=True) as warned:
+        draw = Figure.savefig if drawn else lambda figure, target, **_: target.write(b"no picture")
+        with contextlib.chdir(here), patch.object(Figure, "savefig", draw), warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             result = CliRunner().invoke(app, ["fit", "run.toml"], env={"BAYESFRED_DATA": None})
         after = snapshot(root)
@@ -320,13 +326,13 @@ def check(files: Files) -> None:
 
 
 @settings(max_examples=50, derandomize=True, deadline=None, suppress_health_check=[*HealthCheck])
-@given(inputs())
-def test_a_result_or_one_line(files: Files) -> None:
-    check(files)
+@given(inputs(), DRAWN)
+def test_a_result_or_one_line(files: Files, drawn: bool) -> None:
+    check(files, drawn)
 
 
 @pytest.mark.long
 @settings(max_examples=2000, deadline=None, database=None, print_blob=True, suppress_health_check=[*HealthCheck])
-@given(inputs())
-def test_a_result_or_one_line_thousands_of_times(files: Files) -> None:
-    check(files)
+@given(inputs(), DRAWN)
+def test_a_result_or_one_line_thousands_of_times(files: Files, drawn: bool) -> None:
+    check(files, drawn)
