@@ -1,5 +1,25 @@
 """The one exception for input that a user can mend; the command line turns it into one line and exit code 2."""
 
 
+def printable(text: str) -> str:
+    r"""Text with its control characters, line ends and undecodable bytes spelt out, so that a terminal prints them.
+
+    Examples
+    --------
+    >>> print(printable("two\nlines\x1b[31m"))
+    two\nlines\x1b[31m
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 class InputError(ValueError):
-    """Bad input: the text is one line that says what was got, what was expected and what to do."""
+    """Bad input: the text is one printable line that says what was got, what was expected and what to do.
+
+    Parameters
+    ----------
+    text : str
+        Whatever of it no terminal prints is spelt out.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text))

@@ -12,12 +12,12 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
+import math
 import os
 import secrets
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +28,22 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import ArrayLike, NDArray
 
-from bayesfred.errors import InputError
+from bayesfred.errors import InputError, printable
 
-__all__ = ["CatalogueRecord", "FrameRecord", "read_catalogue", "read_frame", "write_catalogue", "write_frame"]
+__all__ = [
+    "CatalogueRecord", "FrameRecord", "read_catalogue", "read_frame", "require_memory", "write_bytes", "write_catalogue",
+    "write_frame",
+]  # fmt: skip
 
 _FITS_SUFFIXES = (".fits", ".fit", ".fts")
 _FRAME_FORMATS = {**dict.fromkeys(_FITS_SUFFIXES, "FITS"), ".h5": "HDF5", ".hdf5": "HDF5", ".npy": "NPY"}
 _CATALOGUE_FORMATS = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv"}
+
+# Counts up to here are whole numbers of their own in float64.
+_MOST_COUNTS = 2.0**53
+
+# What a fit takes at its peak, for each pixel: frame, mask and model in their copies, and a workspace a thread. Measured.
+_BYTES_A_PIXEL = 150 + 24 * (os.cpu_count() or 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +119,8 @@ def read_frame(
     Raises
     ------
     InputError
-        The file is missing, damaged or of another kind; it holds no such image; its numbers are not counts
-        and no gain is given; no pixel is left.
+        The file is missing, damaged or of another kind; it holds no such image; a fit of it would not fit in
+        memory; its numbers are not counts and no gain is given; no pixel is left.
 
     Examples
     --------
@@ -124,10 +133,10 @@ def read_frame(
     """
     path = Path(path)
     kind = _frame_format(path)
-    if gain is not None and not (isfinite(gain) and gain > 0):
+    if gain is not None and not (math.isfinite(gain) and gain > 0):
         raise InputError(f"{path}: gain: got {gain}, expected a positive number of e-/adu")
     for label, level in (("pedestal", pedestal), ("saturation", saturation)):
-        if level is not None and not isfinite(level):
+        if level is not None and not math.isfinite(level):
             raise InputError(f"{path}: {label}: got {level}, expected a finite number in stored units")
     _require_file(path)
     stored = _READERS[kind](path, name)
@@ -140,11 +149,14 @@ def read_frame(
     if not valid.any():
         raise InputError(f"{path}: got every pixel masked ({reasons}), expected some to use")
 
-    counts = np.where(valid, stored, pedestal) - pedestal
-    counts = _require_counts(path, counts) if gain is None else counts * gain
+    with np.errstate(over="ignore"):
+        counts = (np.where(valid, stored, pedestal) - pedestal) * (1.0 if gain is None else gain)
+    _refuse(path, counts, np.abs(counts) > _MOST_COUNTS, f"counts of at most {_MOST_COUNTS:.0e}; check gain and pedestal")
+    if gain is None:
+        counts = _require_counts(path, counts)
     n_masked = int(valid.size - valid.sum())
     masked = f"{n_masked} masked ({reasons})" if n_masked else "none masked"
-    return FrameRecord(counts, valid, n_masked, f"{path.name}: {_by(stored.shape)} pixels, {masked}")
+    return FrameRecord(counts, valid, n_masked, f"{printable(path.name)}: {_by(stored.shape)} pixels, {masked}")
 
 
 def read_catalogue(
@@ -191,7 +203,7 @@ def read_catalogue(
     """
     path = Path(path)
     table_format = _catalogue_format(path)
-    if magnitude is not None and (zero_point is None or not isfinite(zero_point)):
+    if magnitude is not None and (zero_point is None or not math.isfinite(zero_point)):
         raise InputError(f"{path}: zero_point: got {zero_point}, expected a number with magnitude; give both")
     _require_file(path)
     with _readable(path, "table"), warnings.catch_warnings():
@@ -252,7 +264,7 @@ def write_frame(path: str | Path, counts: ArrayLike, *, overwrite: bool = False)
     else:
         fits.PrimaryHDU(image).writeto(buffer)
     content = buffer.getvalue()
-    _write(path, gzip.compress(content) if path.suffix.lower() == ".gz" else content, overwrite)
+    write_bytes(path, gzip.compress(content) if path.suffix.lower() == ".gz" else content, overwrite=overwrite)
 
 
 def write_catalogue(path: str | Path, record: CatalogueRecord, *, overwrite: bool = False) -> None:
@@ -276,7 +288,61 @@ def write_catalogue(path: str | Path, record: CatalogueRecord, *, overwrite: boo
     table_format = _catalogue_format(path)
     buffer = io.StringIO()
     Table([record.x, record.y, record.flux], names=["x", "y", "flux"]).write(buffer, format=table_format)
-    _write(path, buffer.getvalue().encode(), overwrite)
+    write_bytes(path, buffer.getvalue().encode(), overwrite=overwrite)
+
+
+def write_bytes(path: Path, content: bytes, *, overwrite: bool = False) -> None:
+    """Write a file in one step: a reader meets the old file or the new one, and a link is replaced, not followed.
+
+    Parameters
+    ----------
+    path : Path
+    content : bytes
+    overwrite : bool
+        Replace a file that exists.
+
+    Raises
+    ------
+    InputError
+        The file exists; the folder cannot be written.
+    """
+    if os.path.lexists(path) and not overwrite:
+        raise InputError(f"{path}: exists already, expected a new file; rename it or give --overwrite")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}), expected a folder that can be") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def require_memory(where: str, shape: tuple[int, int]) -> None:
+    """Refuse a frame of which a fit would not fit in this machine's memory.
+
+    Parameters
+    ----------
+    where : str
+        What claims to have this shape, to begin the line with.
+    shape : tuple of int, (ny, nx)
+
+    Raises
+    ------
+    InputError
+        With the estimate.
+    """
+    need, memory = math.prod(shape) * _BYTES_A_PIXEL, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if need > memory:
+        raise InputError(
+            f"{where}: got {_by(shape)} pixels, whose fit would need about {need / 1e9:.3g} GB of memory, expected at most the "
+            f"{memory / 1e9:.3g} GB of this machine: cut the frame or bin it"
+        )
 
 
 def _frame_format(path: Path) -> str:
@@ -298,7 +364,7 @@ def _catalogue_format(path: Path) -> str:
 
 
 def _require_file(path: Path) -> None:
-    if not path.exists():
+    if not os.path.exists(path):  # unlike Path.exists, whatever the path
         raise InputError(f"{path}: no such file, expected one to read; check the path")
     if not path.is_file():
         raise InputError(f"{path}: not a file, expected one to read; check the path")
@@ -329,22 +395,31 @@ def _require_image(path: Path, shape: tuple[int, ...] | None, dtype: np.dtype[An
         raise InputError(f"{where}: got values of type {dtype}, expected real numbers")
 
 
+class _Stream(io.BufferedReader):
+    """A file in which a seek beyond the end, as absurd headers ask for, goes to the end."""
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        return super().seek(min(offset, os.fstat(self.fileno()).st_size), whence)
+
+
 def _read_fits(path: Path, name: str | None) -> NDArray[np.float64]:
     seen = []
     with _readable(path, "FITS"), warnings.catch_warnings():
         # Warnings are about headers; data that are cut short raise.
         warnings.simplefilter("ignore", AstropyWarning)
-        content = path.read_bytes()
-        if path.suffix.lower() == ".gz":
-            content = gzip.decompress(content)  # all of it, checksum included, which astropy does not reach
+        zipped = path.suffix.lower() == ".gz"
         # uint=False: as unsigned integers BLANK pixels would come through as ordinary numbers.
-        with fits.open(io.BytesIO(content), memmap=False, uint=False) as hdus:
+        with gzip.open(path) if zipped else _Stream(io.FileIO(path)) as stream, fits.open(stream, memmap=False, uint=False) as hdus:
             for index, hdu in enumerate(hdus):
                 if not hdu.is_image:
                     continue
                 seen.append(f"{hdu.name or index} {_by(hdu.shape) or 'without data'}")
                 if len(hdu.shape) == 2 and min(hdu.shape) > 0 and (name or hdu.name).upper() == hdu.name:
-                    return np.asarray(hdu.data, dtype=np.float64)
+                    require_memory(f"{path}: {hdu.name or index}", hdu.shape)
+                    image = np.asarray(hdu.data, dtype=np.float64)
+                    while zipped and stream.read(1 << 20):
+                        pass  # up to the checksum, which astropy does not reach
+                    return image
     wanted = "a 2-D image" if name is None else f"a 2-D image in extension {name!r}"
     raise InputError(f"{path}: got {', '.join(seen) or 'no image'}, expected {wanted}")
 
@@ -357,6 +432,9 @@ def _read_hdf5(path: Path, name: str | None) -> NDArray[np.float64]:
             present = ", ".join(map(repr, file)) or "nothing"
             raise InputError(f"{path}: got no dataset {key!r}, expected one of: {present}; give its name")
         _require_image(path, dataset.shape, dataset.dtype, key)
+        if dataset.file != file or dataset.external or dataset.is_virtual:
+            raise InputError(f"{path}: {key}: got a dataset kept in another file, expected it in this one; copy it")
+        require_memory(f"{path}: {key}", dataset.shape)
         return np.asarray(dataset[()], dtype=np.float64)
 
 
@@ -367,6 +445,7 @@ def _read_npy(path: Path, name: str | None) -> NDArray[np.float64]:
         # A map checks the file's length before memory is taken for what its heading claims. No pickles.
         stored = np.lib.format.open_memmap(path, mode="r")
         _require_image(path, stored.shape, stored.dtype)
+        require_memory(f"{path}", stored.shape)
         return np.array(stored, dtype=np.float64)
 
 
@@ -380,13 +459,14 @@ _READERS: dict[str, Callable[[Path, str | None], NDArray[np.float64]]] = {
 def _require_counts(path: Path, counts: NDArray[np.float64]) -> NDArray[np.float64]:
     whole: NDArray[np.float64] = np.rint(counts) + 0.0  # + 0.0 turns -0.0 into 0.0
     bad = (np.abs(counts - whole) > 1e-9) | (whole < 0)
+    _refuse(path, counts, bad, "counts (whole numbers, not negative); give gain (e-/adu) and pedestal")
+    return whole
+
+
+def _refuse(path: Path, counts: NDArray[np.float64], bad: NDArray[np.bool_], expected: str) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        raise InputError(
-            f"{path}: got {counts[row, column]:.9g} at row {row}, column {column}, expected counts "
-            "(whole numbers, not negative); give gain (e-/adu) and pedestal"
-        )
-    return whole
+        raise InputError(f"{path}: got {counts[row, column]:.9g} at row {row}, column {column}, expected {expected}")
 
 
 def _column(path: Path, table: Table, name: str) -> NDArray[np.float64]:
@@ -396,7 +476,7 @@ def _column(path: Path, table: Table, name: str) -> NDArray[np.float64]:
     values = np.empty(len(table))
     for row, cell in enumerate(table[name]):
         values[row] = np.nan if np.ma.is_masked(cell) else _number(cell)
-        if not isfinite(values[row]):
+        if not math.isfinite(values[row]):
             got = "nothing" if np.ma.is_masked(cell) else repr(str(cell))
             raise InputError(f"{path}: row {row + 1}, column {name!r}: got {got}, expected a finite number")
     return values
@@ -418,21 +498,3 @@ def _require_distinct(path: Path, record: CatalogueRecord) -> None:
         if first.setdefault(position, row) != row:
             got = f"({position[0]:.9g}, {position[1]:.9g}) again, as in row {first[position]}"
             raise InputError(f"{path}: row {row}: got position {got}, expected each once; remove one row")
-
-
-def _write(path: Path, content: bytes, overwrite: bool) -> None:
-    if path.exists() and not overwrite:
-        raise InputError(f"{path}: exists already, expected a new file; rename it or give --overwrite")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("xb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"{path}: cannot be written ({reason}), expected a folder that can be") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()

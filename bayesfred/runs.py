@@ -1,11 +1,13 @@
 """Whole runs from a run file: build the posterior, fit, sample, judge, report.
 
-`cli.py` is the same from a shell. Settings become objects here, and nowhere else.
+`cli.py` is the same from a shell; `assembly.py` makes the settings objects.
 """
 
+import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,18 +16,12 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from bayesfred import files, settings
+from bayesfred import assembly, files, settings
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
-from bayesfred.errors import InputError
-from bayesfred.imaging.detector import Detector
-from bayesfred.imaging.distortion import PolynomialDistortion
-from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference import priors, verification
+from bayesfred.errors import InputError, printable
+from bayesfred.inference import verification
 from bayesfred.inference.chainfile import Chain, open_chain
-from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.inference.posterior import Nuisances, Posterior
+from bayesfred.inference.posterior import Posterior
 from bayesfred.inference.sampling import sample, versions
 from bayesfred.reporting import html, plots
 
@@ -81,8 +77,8 @@ def demo(folder: PathLike, *, seed: int = 1, overwrite: bool = False) -> Result:
     example = Path(__file__).with_name("example.toml")
     run = settings.read_settings(example)
     run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
-    posterior, truth = _simulated(run, example, seed)
-    return _fit(posterior, Path(folder) / "demo.h5", run, "demo", [DEMO_NOTE], truth=truth, overwrite=overwrite)
+    posterior, truth = assembly.simulated(run, example, seed)
+    return _fit(posterior, Path(folder) / "demo.h5", run, Path("demo"), [DEMO_NOTE], truth=truth, overwrite=overwrite)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
@@ -106,18 +102,20 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
         raise InputError(
             f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts are written: leave them out"
         )
-    posterior, _ = _simulated(run, Path(run_file), run.simulation.seed)
+    posterior, _ = assembly.simulated(run, Path(run_file), run.simulation.seed)
     # written beside the run file, whatever lies in the data folder
-    frame, catalogue = Path(run_file).parent / run.frame.path, Path(run_file).parent / run.catalogue.path
-    if frame.exists() and not overwrite:  # before the catalogue is written
+    folder = Path(run_file).parent
+    frame = settings.within(folder, run.frame.path, f"{run_file}: frame.path")
+    catalogue = settings.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
+    if os.path.lexists(frame) and not overwrite:  # before the catalogue is written
         raise InputError(f"{frame}: exists, expected a new file: rename it, or replace it with --overwrite")
     if run.simulation.grid is not None:
         s = posterior.model.sources
         files.write_catalogue(catalogue, files.CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite)
-        print(f"{catalogue}: {len(s)} sources")
+        print(f"{printable(str(catalogue))}: {len(s)} sources")
     files.write_frame(frame, posterior.counts, overwrite=overwrite)
     ny, nx = posterior.counts.shape
-    print(f"{frame}: {ny} x {nx} pixels, {posterior.counts.sum():.0f} counts")
+    print(f"{printable(str(frame))}: {ny} x {nx} pixels, {posterior.counts.sum():.0f} counts")
 
 
 def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) -> Result:
@@ -143,21 +141,22 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
+    output = _output(run, run_file)
     f = run.frame
-    frame = files.read_frame(
-        settings.resolve(f.path, run_file, must_exist=True), gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
-    )
+    path = settings.resolve(f.path, run_file, must_exist=True)
+    if os.path.exists(output) and output.samefile(path):
+        raise InputError(f"{run_file}: output.path: got the frame's file, expected another: the chain would replace the frame")
+    frame = files.read_frame(path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name)
     print(frame.description)
     ny, nx = frame.counts.shape
-    sources = _sources(run, run_file)
-    try:
-        posterior = _posterior(run, _model(run, (ny, nx), sources), frame.counts, frame.valid)
-    except InputError as error:
-        raise InputError(f"{run_file}: {error}") from None
-    output = Path(run.output.path) if run.output.path else Path("chains") / f"{run_file.stem}.h5"
-    if run.output.path is None:
-        output.parent.mkdir(exist_ok=True)
-    return _fit(posterior, output, run, run_file.stem, [frame.description], resume=resume, overwrite=overwrite)
+    sources, census = assembly.catalogue(run, run_file, (ny, nx))
+    print(census)
+    with _naming(run_file):
+        posterior = assembly.posterior_given(run, assembly.forward_model(run, (ny, nx), sources), frame.counts, frame.valid)
+    if run.output.path is None and not output.parent.is_dir():
+        with _writing(output):
+            output.parent.mkdir()
+    return _fit(posterior, output, run, run_file, [frame.description, census], resume=resume, overwrite=overwrite)
 
 
 def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
@@ -172,8 +171,15 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
     Returns
     -------
     Result
+
+    Raises
+    ------
+    InputError
+        If the chain is missing, damaged, or named as its page or picture would be.
     """
     chain = open_chain(chain_file)
+    if chain.path in _beside(chain.path):
+        raise InputError(f"{chain_file}: got a chain named as its report, which would replace it, expected NAME.h5: rename it")
     return _report(chain, chain.posterior(), Path(chain_file).stem, [], target_ess=target_ess or chain.target_ess)
 
 
@@ -203,69 +209,40 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> bool:
     return all(check.holds for check in checks)
 
 
-def _simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:
-    """A simulated frame's posterior and the true parameters."""
-    s = run.simulation
-    assert s is not None, "checked by the callers"
-    sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux) if s.grid else _sources(run, run_file)
-    model = _model(run, s.shape, sources)
-    unknown = sorted(set(s.theta) - set(model.distortion.names))
-    if unknown:
-        raise InputError(
-            f"{run_file}: simulation.theta: got {', '.join(unknown)}, expected names among {', '.join(model.distortion.names)}"
-        )
-    theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
-    noise = _noise(run)
-    counts = simulate(model, theta, s.background, seed=seed, noise=noise)
-    posterior = _posterior(run, model, counts, None)
-    known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
-    known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
-    truth = np.array([known.get(name, 0.0) for name in posterior.parameter_names])
-    if not np.all(np.isfinite(posterior.expected_counts(truth))):
-        raise InputError(f"{run_file}: simulation.theta: got a distortion that folds a source's image, expected a weaker one")
-    return posterior, truth
+def _output(run: settings.RunSettings, run_file: Path) -> Path:
+    """Where the chain goes: inside the folder that the run is started in, whatever a run file from elsewhere says."""
+    return settings.within(".", run.output.path or Path("chains", f"{run_file.stem}.h5"), f"{run_file}: output.path")
 
 
-def _sources(run: settings.RunSettings, run_file: Path) -> SourceCatalog:
-    c = run.catalogue
-    path = settings.resolve(c.path, run_file, must_exist=True)
-    record = files.read_catalogue(path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point)
-    return SourceCatalog(record.x, record.y, record.flux)
+def _beside(chain: Path) -> tuple[Path, Path]:
+    """Page and picture of a chain file."""
+    return chain.with_suffix(".html"), chain.with_suffix(".png")
 
 
-def _model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog) -> ForwardModel:
-    d = run.distortion
-    if d.terms is None:
-        distortion = PolynomialDistortion(d.f_terms or (), d.g_terms or ())
-    elif d.degree is not None:
-        distortion = PolynomialDistortion.complete(d.degree)
-    else:
-        distortion = getattr(PolynomialDistortion, d.terms)()
-    detector = Detector(shape, binning=run.detector.binning, pixel=run.detector.pixel)
-    m = run.model
-    return ForwardModel(
-        detector, sources, GaussianPSF(run.psf.sigma), distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance
-    )
+@contextmanager
+def _naming(run_file: Path) -> Iterator[None]:
+    """Begin the line of what the objects of a run refuse with the file that describes them."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{run_file}: {error}") from None
 
 
-def _noise(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
-    return BackgroundNoise() if run.noise.kind == "background" else PoissonNoise(run.noise.read_noise)
-
-
-def _posterior(
-    run: settings.RunSettings, model: ForwardModel, counts: Floats, mask: npt.NDArray[np.bool_] | None
-) -> Posterior:
-    n = run.nuisances
-    nuisances = Nuisances(n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint, n.position_scatter)
-    prior = {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
-    return Posterior(model, counts, prior=prior, noise=_noise(run), mask=mask, nuisances=nuisances)
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what a disk or a file system refuses into one line."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}), expected room and a folder that can be") from error
 
 
 def _fit(
     posterior: Posterior,
     output: Path,
     run: settings.RunSettings,
-    title: str,
+    run_file: Path,
     notes: Sequence[str],
     *,
     truth: Floats | None = None,
@@ -278,14 +255,22 @@ def _fit(
         raise InputError("--resume and --overwrite: got both, expected one: go on with the run, or replace it")
     if not output.parent.is_dir():
         raise InputError(f"{output}: no folder {output.parent}, expected one to write the chain to: create it")
-    if output.exists() and not (overwrite or resume):  # said before the work, not after it
-        raise InputError(f"{output}: exists, expected a new file: go on with --resume, or replace it with --overwrite")
-    chain = sample(
-        posterior, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
-        target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
-    )  # fmt: skip
+    page, picture = _beside(output)
+    for path in (output, page, picture, output.with_name(f".{output.name}.lock")):
+        if os.path.islink(path) or os.path.isdir(path):
+            raise InputError(f"{path}: got a link or a folder, expected a file or nothing there: remove it, or write elsewhere")
+    resume = resume and os.path.exists(output)
+    for path in (output, page, picture):  # said before the work, not after it
+        if os.path.exists(path) and not (overwrite or resume):
+            remedy = "go on with --resume, or replace it with --overwrite" if path == output else "move it, or use --overwrite"
+            raise InputError(f"{path}: exists, expected a new file: {remedy}")
+    with _writing(output), _naming(run_file):
+        chain = sample(
+            posterior, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
+            target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
+        )  # fmt: skip
     print(f"maximum: {chain.estimate.message}")
-    return _report(chain, posterior, title, notes, target_ess=s.target_ess, truth=truth, run=run)
+    return _report(chain, posterior, run_file.stem, notes, target_ess=s.target_ess, truth=truth, run=run)
 
 
 def _report(
@@ -304,18 +289,23 @@ def _report(
     Console(width=None if sys.stdout.isatty() else 120).print(_table(chain, diagnostics, truth))
     if chain.n_invalid:
         print(f"{chain.n_invalid} log-probabilities were NaN or infinite and taken as -inf: narrower priors avoid that")
-    page = html.write_report(
-        chain.path.with_suffix(".html"), title=title, chain=chain, diagnostics=diagnostics, posterior=posterior, truth=truth,
-        notes=notes, settings=run.model_dump_json(indent=2) if run else None,
-    )  # fmt: skip
-    picture = chain.path.with_suffix(".png")
+    page, picture = _beside(chain.path)
+    with _writing(page):
+        html.write_report(
+            page, title=printable(title), chain=chain, diagnostics=diagnostics, posterior=posterior, truth=truth, notes=notes,
+            settings=run.model_dump_json(indent=2) if run else None,
+        )  # fmt: skip
     expected = posterior.expected_counts(chain.estimate.params)
     sigma = posterior.sigma(chain.estimate.params)
     figure = plots.overview(
         posterior.counts, expected, sigma, posterior.mask, chain.draws(), chain.parameter_names, truth=truth
     )
-    figure.savefig(picture, dpi=150)
-    print(f"{diagnostics.message}\nchain   {chain.path}\nreport  {page}\npicture {picture}")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=150)
+    files.write_bytes(picture, buffer.getvalue(), overwrite=True)
+    print(diagnostics.message)
+    for label, path in (("chain", chain.path), ("report", page), ("picture", picture)):
+        print(f"{label:8}{printable(str(path))}")
     return Result(chain, diagnostics)
 
 

@@ -23,14 +23,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from bayesfred.errors import InputError
 
-__all__ = ["PriorSettings", "RunSettings", "read_settings", "resolve"]
+__all__ = ["PriorSettings", "RunSettings", "read_settings", "resolve", "within"]
 
-_Name = Annotated[str, Field(min_length=1)]
-_Positive = Annotated[float, Field(gt=0)]
-_NotNegative = Annotated[float, Field(ge=0)]
-_Count = Annotated[int, Field(ge=1)]
-_Power = Annotated[int, Field(ge=0)]
-_Seed = Annotated[int, Field(ge=0)]
+# Far outside what frames need, and far inside what float64, int64 and memory hold.
+_LARGEST = 1e15
+_Name = Annotated[str, Field(min_length=1, max_length=1000)]
+_Float = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
+_Positive = Annotated[float, Field(gt=0, le=_LARGEST)]
+_NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+_Count = Annotated[int, Field(ge=1, le=10**15)]
+_Binning = Annotated[int, Field(ge=1, le=1000)]
+_Power = Annotated[int, Field(ge=0, le=10)]
+_Seed = Annotated[int, Field(ge=0, lt=2**63)]
 _Term = tuple[_Power, _Power, _Power, _Power]
 
 _TOO_DEEP = "got tables or arrays nested too deeply, expected sections of key = value"
@@ -60,8 +64,8 @@ class FrameSettings(_Section):
 
     path: _Name
     gain: _Positive | None = None
-    pedestal: float = 0.0
-    saturation: float | None = None
+    pedestal: _Float = 0.0
+    saturation: _Float | None = None
     name: _Name | None = None
 
 
@@ -87,7 +91,7 @@ class CatalogueSettings(_Section):
     y: _Name = "y"
     flux: _Name = "flux"
     magnitude: _Name | None = None
-    zero_point: float | None = None
+    zero_point: _Float | None = None
 
     @model_validator(mode="after")
     def _both_or_neither(self) -> CatalogueSettings:
@@ -109,7 +113,7 @@ class DetectorSettings(_Section):
     """
 
     pixel: Literal["impulse", "box"] = "impulse"
-    binning: _Count = 1
+    binning: _Binning = 1
 
 
 class PSFSettings(_Section):
@@ -138,7 +142,7 @@ class DistortionSettings(_Section):
     """
 
     terms: Literal["mirrored", "paper", "pinhole", "complete"] | None = None
-    degree: Annotated[int, Field(ge=2)] | None = None
+    degree: Annotated[int, Field(ge=2, le=10)] | None = None
     f_terms: tuple[_Term, ...] | None = None
     g_terms: tuple[_Term, ...] | None = None
 
@@ -258,8 +262,8 @@ class SamplingSettings(_Section):
     """
 
     seed: _Seed = 1
-    ensembles: Annotated[int, Field(ge=2)] = 4
-    walkers: Annotated[int, Field(ge=4, multiple_of=2)] = 32
+    ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
+    walkers: Annotated[int, Field(ge=4, le=10_000, multiple_of=2)] = 32
     target_ess: _Count = 1000
     steps: _Count | None = None
 
@@ -270,7 +274,7 @@ class OutputSettings(_Section):
     Attributes
     ----------
     path : str, optional
-        The chain file, .h5.
+        The chain file, .h5, inside the folder that the run is started in.
     """
 
     path: Annotated[str, Field(pattern=r"\.h5$")] | None = None
@@ -289,7 +293,7 @@ class GridSettings(_Section):
         Flux of each source.
     """
 
-    side: _Count
+    side: Annotated[int, Field(ge=1, le=1000)]
     spacing: _Positive
     flux: _Positive
 
@@ -312,7 +316,7 @@ class SimulationSettings(_Section):
     """
 
     shape: tuple[_Count, _Count]
-    theta: dict[str, float]
+    theta: dict[str, _Float]
     background: _NotNegative
     seed: _Seed = 1
     grid: GridSettings | None = None
@@ -380,8 +384,9 @@ def read_settings(path: str | Path) -> RunSettings:
     try:
         # A byte order mark, which some editors write, is not TOML.
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        # JSON is what result files keep, so a run file is checked by the rules it will be read back with.
-        return RunSettings.model_validate_json(json.dumps(table, default=str))
+        # JSON is what result files keep, so a run file is checked by the rules it will be read back with. Dates, which
+        # only TOML has, are no key's type.
+        return RunSettings.model_validate_json(json.dumps(table, default=lambda date: {str(date): "date"}))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected a run file; check the path") from None
     except OSError as error:
@@ -428,7 +433,7 @@ def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False)
     places = [Path(run_file).parent / path]
     if folder and not Path(path).is_absolute():
         places.append(Path(folder) / path)
-    found = next((place for place in places if place.exists()), None)
+    found = next((place for place in places if os.path.exists(place)), None)  # unlike Path.exists, whatever the path
     if found is None and must_exist:
         remedy = "check the path"
         if not Path(path).is_absolute():
@@ -436,6 +441,47 @@ def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False)
         tried = " or ".join(map(str, places))
         raise InputError(f"{run_file}: got {str(path)!r}, expected a file at {tried}; {remedy}")
     return found or places[0]
+
+
+def within(folder: str | Path, path: str | Path, where: str) -> Path:
+    """Find the place of a file to write, which a run file names but must not choose outside a folder.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The folder.
+    path : str or Path
+        As the run file gives it, relative to the folder.
+    where : str
+        Run file and key, to begin the line with.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        The path leads out of the folder, by being absolute, by .. or through links, or it is no path.
+
+    Examples
+    --------
+    >>> within("runs", "night/one.h5", "run.toml: output.path").as_posix()
+    'runs/night/one.h5'
+    >>> within("runs", "../one.h5", "run.toml: output.path")
+    Traceback (most recent call last):
+    ...
+    bayesfred.errors.InputError: run.toml: output.path: got '../one.h5', which leads out of ..., expected a path that stays inside
+    """
+    place = Path(folder) / path
+    try:
+        inside = place.resolve().is_relative_to(Path(folder).resolve())
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a name too long, a zero byte
+        inside = False
+    if not inside:
+        leads = f"{str(path)!r}, which leads out of {Path(folder).absolute()}"
+        raise InputError(f"{where}: got {leads}, expected a path that stays inside")
+    return place
 
 
 def _mistake(details: Any) -> str:

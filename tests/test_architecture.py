@@ -96,7 +96,8 @@ MAY_IMPORT = {
     "reporting": ("errors", "imaging", "inference", "analysis"),
     "files": ("errors",),
     "settings": ("errors",),
-    "runs": ("errors", "imaging", "inference", "analysis", "reporting", "files", "settings"),
+    "assembly": ("errors", "imaging", "inference", "files", "settings"),
+    "runs": ("errors", "imaging", "inference", "analysis", "reporting", "files", "settings", "assembly"),
 }
 
 

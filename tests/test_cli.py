@@ -5,6 +5,8 @@ for its exit code, its one line, what the line names, and that no file changed.
 """
 
 import contextlib
+import html
+import json
 import os
 import re
 import shutil
@@ -22,18 +24,21 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 from matplotlib.image import imread
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import bayesfred
-from bayesfred import files
+from bayesfred import assembly, files
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.cli import app
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.chainfile import Chain, open_chain
 from bayesfred.inference.examine import seal
 from bayesfred.inference.posterior import Posterior
-from bayesfred.settings import read_settings
+from bayesfred.settings import RunSettings, read_settings
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BAYESFRED_DATA") or Path(__file__).parents[2] / "shared" / "data")
@@ -370,10 +375,45 @@ def spoil_pixel(value: float) -> Prepare:
     return prepare
 
 
+def cut_frame(size: int) -> Prepare:
+    """Keep the first bytes of the frame."""
+    return lambda folder: (folder / "frame.fits").write_bytes((folder / "frame.fits").read_bytes()[:size])
+
+
+def claim(columns: int, rows: int) -> Prepare:
+    """Let the frame's header claim a size; the data stay."""
+
+    def prepare(folder: Path) -> None:
+        content = (folder / "frame.fits").read_bytes()
+        for card, value in ((b"NAXIS1  =", columns), (b"NAXIS2  =", rows)):
+            start = content.index(card)
+            content = content[:start] + card + f"{value:>21}".encode() + content[start + 30 :]
+        (folder / "frame.fits").write_bytes(content)
+
+    return prepare
+
+
+def link(name: str, target: str) -> Prepare:
+    return lambda folder: (folder / name).symlink_to(folder / target)
+
+
+def both(*steps: Prepare) -> Prepare:
+    def prepare(folder: Path) -> None:
+        for step in steps:
+            step(folder)
+
+    return prepare
+
+
 def frame_without_image(folder: Path) -> None:
     """A FITS file of one header: 36 cards of 80 characters, and no data."""
     cards = ("SIMPLE  =                    T", "BITPIX  =                    8", "NAXIS   =                    0", "END")
     (folder / "frame.fits").write_bytes("".join(card.ljust(80) for card in cards).ljust(2880).encode())
+
+
+def frame_in_hdf5(folder: Path) -> None:
+    """Put the frame where the chain would go."""
+    files.write_frame(folder / "run.h5", files.read_frame(folder / "frame.fits").counts)
 
 
 def unchanged(folder: Path) -> None:
@@ -391,7 +431,11 @@ class Refusal:
 
 
 SIMULATE = ("simulate", "run.toml", "--overwrite")
+OVERWRITE = ("fit", "run.toml", "--overwrite")
 MIRRORED = 'terms = "mirrored"'
+IN_HDF5 = 'path = "run.h5"'
+TOO_LARGE = "shape = [1000000, 1000000]\nbackground = 1"
+FOLDED = 'distribution = "uniform"\nloc = -0.3\nscale = 0.1'
 ON_AXIS = "f_terms = [[1, 0, 1, 0]]\ng_terms = [[0, 0, 2, 0]]"
 
 REFUSALS = [
@@ -400,15 +444,40 @@ REFUSALS = [
     Refusal("unknown key", sections(frame='path = "frame.fits"\ngian = 2.0'), ("run.toml", "frame.gian", "'gain'")),
     Refusal("missing frame", without("frame.fits"), ("run.toml", "frame.fits", "BAYESFRED_DATA")),
     Refusal("not a FITS", content("frame.fits", "no FITS at all"), ("frame.fits", "FITS")),
+    Refusal("truncated FITS", cut_frame(20_000), ("frame.fits", "FITS")),
+    Refusal("truncated header", cut_frame(1000), ("frame.fits", "FITS")),
+    Refusal("empty FITS", cut_frame(0), ("frame.fits", "FITS")),
+    Refusal("absurd NAXIS", claim(10**9, 10**9), ("frame.fits", "1000000000 x 1000000000 pixels", "GB of memory", "bin")),
+    Refusal("more than memory", claim(10**6, 10**5), ("frame.fits", "100000 x 1000000 pixels", "GB of memory", "bin")),
+    Refusal("negative NAXIS", claim(-75, 60), ("frame.fits",)),
     Refusal("no image", frame_without_image, ("frame.fits", "2-D image")),
     Refusal("negative counts", spoil_pixel(-3.0), ("frame.fits", "-3", "row 5, column 7", "gain")),
     Refusal("part of a count", spoil_pixel(1.5), ("frame.fits", "1.5", "row 5, column 7", "gain")),
+    Refusal("more than float64 counts", spoil_pixel(1e300), ("frame.fits", "1e+300", "row 5, column 7", "at most 9e+15")),
+    Refusal("nested TOML", content("run.toml", f"deep = {'[' * 20_000}{']' * 20_000}"), ("run.toml", "nested too deeply")),
+    Refusal("nan in TOML", sections(psf="sigma = nan"), ("run.toml", "psf.sigma", "nan", "finite")),
+    Refusal("inf in TOML", sections(model="tolerance = -inf"), ("run.toml", "model.tolerance", "inf", "finite")),
+    Refusal("text for a number", sections(psf='sigma = "2.5"'), ("run.toml", "psf.sigma", "'2.5'", "number")),
+    Refusal("number for a text", sections(frame="path = 7"), ("run.toml", "frame.path", "7", "string")),
+    Refusal("date for a text", sections(frame="path = 2000-01-01"), ("run.toml", "frame.path", "2000-01-01", "string")),
+    Refusal("array for a table", content("run.toml", "frame = [1]"), ("run.toml", "frame", "[1]", "table")),
+    Refusal("duplicate sources", content("stars.csv", "x,y,flux\n1,2,9\n3,4,9\n1,2,8\n"), ("stars.csv", "row 3", "in row 1")),
+    Refusal("negative flux", content("stars.csv", "x,y,flux\n1,2,-9\n"), ("stars.csv", "row 1", "'flux'", "-9", "positive")),
+    Refusal("nan position", content("stars.csv", "x,y,flux\nnan,2,9\n"), ("stars.csv", "row 1", "'x'", "nan", "finite")),
     Refusal("missing catalogue", without("stars.csv"), ("run.toml", "stars.csv", "BAYESFRED_DATA")),
     Refusal("missing column", content("stars.csv", "x,y,light\n0,0,1\n"), ("stars.csv", "'flux'", "'light'")),
     Refusal("empty catalogue", content("stars.csv", "x,y,flux\n"), ("stars.csv", "empty")),
     Refusal("catalogue of no bytes", content("stars.csv", ""), ("stars.csv", "empty")),
     Refusal("output exists", content("run.h5", "precious"), ("run.h5", "exists", "--resume", "--overwrite")),
+    Refusal("page exists", content("run.html", "precious"), ("run.html", "exists", "--overwrite")),
+    Refusal("picture exists", content("run.png", "precious"), ("run.png", "exists", "--overwrite")),
+    Refusal("output is a folder", lambda folder: (folder / "run.h5").mkdir(), ("run.h5", "folder", "remove"), OVERWRITE),
+    Refusal("output is the frame", both(frame_in_hdf5, sections(frame=IN_HDF5)), ("run.toml", "output.path", "frame"), OVERWRITE),
+    Refusal("name too long", sections(output=f'path = "{"a" * 990}.h5"'), (".h5", "too long")),
+    Refusal("name too long for its companions", sections(output=f'path = "{"a" * 250}.h5"'), (".h5", "too long")),
     Refusal("missing output folder", sections(output='path = "absent/run.h5"'), ("run.h5", "no folder absent")),
+    Refusal("simulated frame too large", sections(simulation=TOO_LARGE), ("run.toml", "simulation.shape", "GB"), SIMULATE),
+    Refusal("folded map", sections(**{"simulation.theta": "f_ux = -0.2"}), ("run.toml", "simulation.theta", "folds"), SIMULATE),
     Refusal("no simulation", content("run.toml", run_text().split("[simulation]")[0]), ("run.toml", "simulation"), SIMULATE),
     Refusal("unknown true term", sections(**{"simulation.theta": "f_zz = 1"}), ("run.toml", "simulation.theta", "f_zz"), SIMULATE),
     Refusal("simulated files exist", unchanged, ("exists", "--overwrite"), ("simulate", "run.toml")),
@@ -422,6 +491,8 @@ DESCRIBED = [
     Refusal("term on the axis", sections(distortion=ON_AXIS), ("g_terms", "g_u2", "i + j >= 1")),
     Refusal("narrow PSF", sections(psf="sigma = 0.3"), ("psf", "sigma", "0.3", "impulse", "box")),
     Refusal("prior of nothing", sections(**{"prior.f_zz": 'distribution = "norm"'}), ("prior", "f_zz", "g_vy")),
+    Refusal("folds alone", sections(**{"prior.f_ux": FOLDED}), ("run.toml", "no density", "fold")),
+    Refusal("pixels wider than the PSF", sections(psf="sigma = 1e-4", detector='pixel = "box"'), ("psf", "sigma", "1e+04", "box")),
     Refusal("unknown distribution", sections(**{"prior.f_ux": 'distribution = "nrm"'}), ("prior.f_ux", "distribution", "'nrm'")),
     Refusal("prior's keyword", sections(**{"prior.f_ux": 'distribution = "norm"\nsd = 1'}), ("prior.f_ux", "norm", "sd")),
 ]
@@ -451,7 +522,7 @@ def check_refusal(refusal: Refusal, folder: Path) -> Output:
 
 def names_a_file(output: Output) -> bool:
     """Whether the line begins with the file that has to be mended."""
-    return re.match(r"bayesfred: [^:]*\.(toml|fits|csv|h5): ", output.stderr) is not None
+    return re.match(r"bayesfred: [^:]*\.(toml|fits|csv|h5|html|png): ", output.stderr) is not None
 
 
 @pytest.mark.parametrize("refusal", by_name(REFUSALS))
@@ -545,6 +616,204 @@ def test_refusal_from_a_shell(folder: Path) -> None:
     )
     assert_refused(Output(done.returncode, done.stdout, done.stderr), "absent.toml")
     assert done.stdout == ""
+
+
+# ------------------------------------------------------------------------------------------- what is odd, and accepted or counted
+
+
+def page_text(path: Path) -> str:
+    """What a browser shows of a page."""
+    return html.unescape(re.sub(r"<[^>]*>", "", path.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("suffix", [".fits.gz", ".fits.fz"])
+def test_compressed_frames_are_fitted(suffix: str, folder: Path) -> None:
+    files.write_frame(folder / f"frame{suffix}", files.read_frame(folder / "frame.fits").counts)
+    sections(frame=f'path = "frame{suffix}"', sampling=FEW_STEPS)(folder)
+    assert invoke(folder, "fit", "run.toml").code == 3
+    counts = open_chain(folder / "run.h5").posterior().counts
+    np.testing.assert_array_equal(counts, files.read_frame(folder / "frame.fits").counts)
+
+
+def test_saturated_and_lost_pixels_are_counted_on_screen_and_page(folder: Path) -> None:
+    counts = files.read_frame(folder / "frame.fits").counts.copy()
+    counts[0, :3], counts[1, :2], counts[2, 0] = 5000.0, np.nan, np.inf
+    files.write_frame(folder / "frame.fits", counts, overwrite=True)
+    sections(frame='path = "frame.fits"\nsaturation = 5000', sampling=FEW_STEPS)(folder)
+    output = invoke(folder, "fit", "run.toml")
+    line = "frame.fits: 60 x 75 pixels, 6 masked (2 NaN, 1 infinite, 3 saturated)"
+    assert line in output.stdout
+    assert line in page_text(folder / "run.html")
+    mask = open_chain(folder / "run.h5").posterior().mask
+    np.testing.assert_array_equal(mask, np.isfinite(counts) & (counts < 5000))
+
+
+def test_sources_at_the_edge_are_kept_and_those_outside_left_out(folder: Path) -> None:
+    """The frame reaches to 37.5 and 30. The first added source is inside, the next outside within reach, two beyond."""
+    text = (folder / "stars.csv").read_text()
+    (folder / "stars.csv").write_text(text + "36,0,5000\n-39,-31,5000\n80,0,5000\n0,-1e300,5000\n")
+    sections(sampling=FEW_STEPS)(folder)
+    output = invoke(folder, "fit", "run.toml")
+    line = "stars.csv: 13 sources, 2 at the frame's edge, 2 outside left out"
+    assert output.code == 3
+    assert line in output.stdout
+    assert line in page_text(folder / "run.html")
+    sources = open_chain(folder / "run.h5").posterior().model.sources
+    assert sources.x.tolist()[-2:] == [36.0, -39.0]
+    assert len(sources) == 11
+
+
+def test_what_is_left_out_as_outside_changes_no_pixel(simulated: Path) -> None:
+    """A source just beyond, whose image a distortion of three prior standard deviations brings nearer, gives no light."""
+    run = read_settings(simulated / "run.toml")
+    model = open_model(run, x=37.5 * (1 + assembly.STRAY) + 2.5 * (-2 * np.log(1e-8)) ** 0.5)
+    prior = 0.1 / 37.5  # of f_ux: a tenth of the half-width at the corner
+    theta = np.array([3 * prior, 0.0, 0.0]) * 37.5 / model.sources.x[0]
+    assert model.expected_counts(theta).max() < 1e-7 * 5e3
+    assert open_model(run, x=36.0).expected_counts(theta).max() > 100  # what is inside does
+
+
+def open_model(run: RunSettings, x: float) -> ForwardModel:
+    return assembly.forward_model(run, (60, 75), SourceCatalog(np.array([x]), np.array([0.0]), np.array([5e3])))
+
+
+def test_zero_background(folder: Path) -> None:
+    """Pixels without light and without counts."""
+    sections(simulation="shape = [60, 75]\nbackground = 0", sampling=FEW_STEPS)(folder)
+    assert invoke(folder, *SIMULATE).code == 0
+    assert invoke(folder, "fit", "run.toml").code == 3
+    chain = open_chain(folder / "run.h5")
+    assert np.median(chain.posterior().counts) == 0
+    assert np.isfinite(chain.chain).all() and np.isfinite(chain.log_prob).all()
+
+
+def test_counts_where_none_are_expected_are_impossible(finished: tuple[Path, Output]) -> None:
+    """Without a background there is no light far from the sources, but there are counts: -inf, and NaN never."""
+    posterior = open_chain(finished[0] / "run.h5").posterior()
+    params = np.array([*TRUTH.values(), 0.0])
+    assert posterior.expected_counts(params).min() == 0
+    assert posterior.log_prob(params) == -np.inf
+    np.testing.assert_array_equal(posterior.log_prob(np.stack([params, params])), [-np.inf, -np.inf])
+    assert np.isfinite(posterior.log_prob([*TRUTH.values(), 1e-3]))
+
+
+# -------------------------------------------------------------------------------------------- what a run file must not do or show
+
+
+def escape(kind: str) -> Prepare:
+    """Let the run file name an output outside its folder, in one of several ways."""
+
+    def prepare(folder: Path) -> None:
+        outside = folder.parent / "outside"
+        outside.mkdir()
+        (folder / "link").symlink_to(outside)
+        (folder / "round").symlink_to("round")
+        paths = {
+            "absolute": f"{outside}/run.h5",
+            "parent": "../outside/run.h5",
+            "parent below": "link/../../outside/run.h5",
+            "link": "link/run.h5",
+            "circle": "round/run.h5",
+            "zero byte": "a\\u0000.h5",
+        }
+        sections(output=f'path = "{paths[kind]}"', sampling=FEW_STEPS)(folder)
+
+    return prepare
+
+
+@pytest.mark.parametrize("kind", ["absolute", "parent", "parent below", "link", "circle", "zero byte"])
+def test_no_chain_outside_the_folder_of_the_run(kind: str, folder: Path) -> None:
+    check_refusal(Refusal("", escape(kind), ("run.toml", "output.path"), OVERWRITE), folder)
+    assert snapshot(folder.parent / "outside") == {}
+
+
+def test_no_chain_through_a_linked_default_folder(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    (folder / "chains").symlink_to(tmp_path / "outside")
+    (folder / "run.toml").write_text(run_text(sampling=FEW_STEPS).replace('[output]\npath = "run.h5"', "[output]"))
+    check_refusal(Refusal("", unchanged, ("run.toml", "output.path", "leads out of")), folder)
+
+
+@pytest.mark.parametrize("name", ["run.h5", "run.html", "run.png", ".run.h5.lock"])
+@pytest.mark.parametrize("target", ["precious", "absent"])
+@pytest.mark.parametrize("option", ["", "--overwrite", "--resume"])
+def test_links_are_not_written_through(name: str, target: str, option: str, folder: Path) -> None:
+    (folder / "precious").write_text("precious")
+    args = ("fit", "run.toml", *([option] if option else []))
+    assert names_a_link(check_refusal(Refusal("", link(name, target), (name, "link", "remove"), args), folder))
+
+
+def names_a_link(output: Output) -> bool:
+    return re.match(r"bayesfred: [^ ]+: got a link", output.stderr) is not None
+
+
+@pytest.mark.parametrize("name", ["run.html", "run.png"])
+def test_report_replaces_links_and_leaves_their_targets(name: str, finished: tuple[Path, Output], tmp_path: Path) -> None:
+    shutil.copy(finished[0] / "run.h5", tmp_path)
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / name).symlink_to("precious")
+    assert invoke(tmp_path, "report", "run.h5").code in (0, 3)
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert not (tmp_path / name).is_symlink()
+
+
+def test_report_does_not_replace_its_chain(finished: tuple[Path, Output], tmp_path: Path) -> None:
+    shutil.copy(finished[0] / "run.h5", tmp_path / "run.png")
+    check_refusal(Refusal("", unchanged, ("run.png", "rename"), ("report", "run.png")), tmp_path)
+
+
+@pytest.mark.parametrize("section", ["frame", "catalogue"])
+@pytest.mark.parametrize("place", ["../outside/new{}", "{root}/outside/new{}", "link/new{}"])
+def test_simulate_writes_beside_the_run_file_only(section: str, place: str, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    (folder / "link").symlink_to(tmp_path / "outside")
+    path = place.format({"frame": ".fits", "catalogue": ".csv"}[section], root=tmp_path)
+    check_refusal(Refusal("", sections(**{section: f'path = "{path}"'}), ("run.toml", f"{section}.path"), SIMULATE), folder)
+    assert snapshot(tmp_path / "outside") == {}
+
+
+EVIL = """<img src=x onerror="alert(1)">'&amp;{{ 7 * 7 }}"""
+
+
+def test_names_are_escaped_on_the_page(folder: Path) -> None:
+    """The run file's name is the title, the frame's and the catalogue's are in the notes, columns in the settings."""
+    (folder / "frame.fits").rename(folder / f"{EVIL}.fits")
+    (folder / "stars.csv").write_text((folder / "stars.csv").read_text().replace("flux", "<script>"))
+    (folder / "stars.csv").rename(folder / f"{EVIL}.csv")
+    toml = json.dumps(EVIL)[:-1]
+    catalogue = f'path = {toml}.csv"\nflux = "<script>"'
+    (folder / f"{EVIL}.toml").write_text(run_text(frame=f'path = {toml}.fits"', catalogue=catalogue, sampling=FEW_STEPS))
+    assert invoke(folder, "fit", f"{EVIL}.toml").code == 3
+    page = (folder / "run.html").read_text(encoding="utf-8")
+    found = _Tags(page)
+    assert "script" not in found.tags
+    assert all(reference.startswith("data:image/png;base64,") for reference in found.references)
+    assert "onerror=\"" not in page
+    shown = page_text(folder / "run.html")
+    assert f"{EVIL}.fits: 60 x 75 pixels" in shown
+    assert f"{EVIL}.csv: 9 sources" in shown
+    assert '"flux": "<script>"' in shown
+
+
+CONTROL = "\x1b[31m[bold red]\r\nnight\x07\udcff"
+
+
+def test_control_characters_and_markup_are_spelt_out(folder: Path) -> None:
+    """In names of files and FITS extensions, on the screen and on the page."""
+    spelt = r"\x1b[31m[bold red]\r\nnight\x07\udcff"
+    assert spelt in invoke(folder, "fit", f"{CONTROL}.toml").stderr
+    os.replace(folder / "run.toml", folder / f"{CONTROL}.toml")
+    text = run_text(sampling=FEW_STEPS).replace('[output]\npath = "run.h5"', "[output]")
+    (folder / f"{CONTROL}.toml").write_text(text)
+    output = invoke(folder, "fit", f"{CONTROL}.toml")
+    assert output.code == 3
+    assert all(c.isprintable() for line in output.stdout.splitlines() for c in line)
+    assert f"chains/{spelt}.h5" in output.stdout
+    assert f"<title>{spelt}</title>" in (folder / "chains" / f"{CONTROL}.html").read_text(encoding="utf-8")
+
+    image = fits.ImageHDU(np.zeros((2, 2, 2)), name="<script>[red]")
+    fits.HDUList([fits.PrimaryHDU(), image]).writeto(folder / "frame.fits", overwrite=True)
+    assert "<SCRIPT>[RED] 2 x 2 x 2" in invoke(folder, "fit", f"{CONTROL}.toml", "--overwrite").stderr
 
 
 # -------------------------------------------------------------------------------------------------------------- interruption

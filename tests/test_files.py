@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -207,6 +208,71 @@ def test_damaged_fits_headings(tmp_path: Path) -> None:
     assert "damaged" in message(read_frame, tmp_path / "flipped.fits.gz")
 
 
+def huge(folder: Path, suffix: str) -> Path:
+    """A small file whose image claims more pixels than memory holds."""
+    path = folder / f"frame{suffix}"
+    if suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file.create_dataset("counts", (10**6, 10**6), "f8", chunks=(1000, 1000))
+        return path
+    if suffix == ".fits.fz":
+        packed = fits.CompImageHDU(COUNTS, quantize_level=0.0)
+        fits.HDUList([fits.PrimaryHDU(), packed]).writeto(path)
+        content, cards = path.read_bytes(), (b"ZNAXIS1 =", b"ZNAXIS2 =")
+    else:
+        write_frame(folder / "small.fits", COUNTS)
+        content, cards = (folder / "small.fits").read_bytes(), (b"NAXIS1  =", b"NAXIS2  =")
+    for card in cards:
+        start = content.index(card)
+        content = content[:start] + card + f"{10**6:>21}".encode() + content[start + 30 :]
+    path.write_bytes(gzip.compress(content) if suffix == ".fits.gz" else content)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".fits.gz", ".fits.fz", ".h5"])
+def test_frames_larger_than_memory_are_refused_unread(tmp_path: Path, suffix: str) -> None:
+    path = huge(tmp_path, suffix)
+    text = message(read_frame, path)
+    assert text.startswith(f"{path}: ")
+    need = float(re.search(r"got 1000000 x 1000000 pixels, whose fit would need about (\S+) GB", text)[1])  # type: ignore[index]
+    assert need == pytest.approx(1e12 * (150 + 24 * (os.cpu_count() or 1)) / 1e9, rel=0.01)
+    assert text.endswith("GB of this machine: cut the frame or bin it")
+
+
+def test_memory_is_asked_before_data_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a machine that has room for the bytes of a frame but not for its fit, every format is refused."""
+    monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 10, "SC_PAGE_SIZE": 100}.__getitem__)
+    for suffix in FRAME_SUFFIXES:
+        write_frame(tmp_path / f"frame{suffix}", COUNTS)
+        assert "got 5 x 7 pixels, whose fit would need about" in message(read_frame, tmp_path / f"frame{suffix}")
+
+
+@pytest.mark.parametrize("kind", ["external storage", "external link", "virtual dataset"])
+def test_hdf5_frames_kept_elsewhere(tmp_path: Path, kind: str) -> None:
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["counts"] = COUNTS
+    with h5py.File(tmp_path / "frame.h5", "w") as file:
+        if kind == "external storage":
+            file.create_dataset("counts", COUNTS.shape, "f8", external=[(str(tmp_path / "other.h5"), 0, h5py.h5f.UNLIMITED)])
+        elif kind == "external link":
+            file["counts"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "counts")
+        else:
+            layout = h5py.VirtualLayout(COUNTS.shape, "f8")
+            layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "counts", COUNTS.shape)
+            file.create_virtual_dataset("counts", layout)
+    assert "frame.h5: counts: got a dataset kept in another file" in message(read_frame, tmp_path / "frame.h5")
+
+
+def test_counts_beyond_float64(tmp_path: Path) -> None:
+    write_frame(tmp_path / "frame.npy", [[2.0**53, 1e308]])
+    assert "got 1e+308 at row 0, column 1, expected counts of at most 9e+15" in message(read_frame, tmp_path / "frame.npy")
+    with_gain = message(read_frame, tmp_path / "frame.npy", gain=10.0)  # the second pixel overflows
+    assert "got 9.00719925e+16 at row 0, column 0" in with_gain
+    assert "got inf at row 0, column 1" in message(read_frame, tmp_path / "frame.npy", gain=100.0, pedestal=2.0**53)
+    frame = read_frame(tmp_path / "frame.npy", saturation=1e300)
+    np.testing.assert_array_equal(frame.counts, [[2.0**53, 0.0]])
+
+
 def test_odd_headings_are_read_in_silence(tmp_path: Path) -> None:
     path = tmp_path / "frame.fits"
     write_frame(path, COUNTS)
@@ -273,6 +339,24 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
     write_frame(tmp_path / "frame.fits", COUNTS + 1, overwrite=True)
     write_catalogue(tmp_path / "stars.csv", stars, overwrite=True)
     np.testing.assert_array_equal(read_frame(tmp_path / "frame.fits").counts, COUNTS + 1)
+
+
+def test_links_are_replaced_and_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("precious")
+    for target in ("precious", "absent"):
+        link = tmp_path / f"{target}.npy"
+        link.symlink_to(target)
+        assert "exists already" in message(write_frame, link, COUNTS)
+        write_frame(link, COUNTS, overwrite=True)
+        assert not link.is_symlink()
+    assert (tmp_path / "precious").read_text() == "precious"
+    assert not (tmp_path / "absent").exists()
+
+
+@pytest.mark.parametrize("name", ["x" * 1000 + ".npy", "zero\0byte.npy", "file/below.npy"])
+def test_names_that_no_file_has(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    assert "no such file" in message(read_frame, tmp_path / name)
 
 
 def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,7 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
+from bayesfred.inference.posterior import Nuisances
 from bayesfred.reporting import plots
 from bayesfred.reporting.html import write_report
 
@@ -49,7 +50,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         parameter_names=names,
         n_parameters=len(names),
         noise=SimpleNamespace(read_noise=0.0),
-        nuisances=SimpleNamespace(background_order=0, flux="fixed"),
+        nuisances=Nuisances(),
         model=model,
         expected_counts=lambda params: model.expected_counts(params[:4], params[4]),
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
@@ -287,6 +288,18 @@ def test_star_panels_show_at_most_24_and_survive_none() -> None:
     assert sum(len(ax.texts) for ax in many.axes) == 24
     none = plots.star_panels(frame, frame, frame, frame > 0, u + 100, v, half_width=2)
     assert "no source" in none.texts[0].get_text()
+
+
+@pytest.mark.parametrize("shape", [(1, 4000), (4000, 1), (1, 1)])
+def test_strips_of_a_frame_make_pictures_of_a_usual_size(shape: tuple[int, int]) -> None:
+    frame = np.full(shape, 4.0)
+    draws = np.random.default_rng(5).normal(size=(100, 2))
+    for figure in (
+        plots.frame_triptych(frame, frame, frame**0.5, frame > 0),
+        plots.overview(frame, frame, frame**0.5, frame > 0, draws, ("f_ux", "background")),
+    ):
+        height, width, _ = pixels(figure).shape
+        assert 0.1 < height / width < 1.2
 
 
 @pytest.mark.parametrize("with_truth", [True, False])

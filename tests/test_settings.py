@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from bayesfred import settings
 from bayesfred.errors import InputError
-from bayesfred.settings import PriorSettings, RunSettings, read_settings, resolve
+from bayesfred.settings import PriorSettings, RunSettings, read_settings, resolve, within
 
 EXAMPLE = Path(settings.__file__).with_name("example.toml").read_text(encoding="utf-8")
 
@@ -224,6 +224,16 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
             "simulation.grid.flux: missing, expected a value; "
             "simulation.grid.flu: unknown key, did you mean 'flux'?",
         ),
+        ("frame", "path = 2000-01-01", "frame.path: got {'2000-01-01': 'date'}, expected a valid string"),
+        ("psf", "sigma = 1e300", "psf.sigma: got 1e+300, expected a number less than or equal to 1000000000000000"),
+        ("psf", f"sigma = 1{'0' * 400}", "psf.sigma: got "),
+        ("detector", "binning = 1001", "detector.binning: got 1001, expected a number less than or equal to 1000"),
+        ("distortion", 'terms = "complete"\ndegree = 11', "distortion.degree: got 11, expected a number less than or"),
+        ("distortion", "f_terms = [[1, 0, 11, 0]]\ng_terms = []", "distortion.f_terms.0.2: got 11, expected a number less"),
+        ("sampling", "walkers = 10002", "sampling.walkers: got 10002, expected a number less than or equal to 10000"),
+        ("sampling", "ensembles = 1001", "sampling.ensembles: got 1001, expected a number less than or equal to 1000"),
+        ("sampling", f"seed = {2**63}", f"sampling.seed: got {2**63}, expected a number less than {2**63}"),
+        ("output", 'path = "run.png"', "output.path: got 'run.png', expected"),
         ("simulate", "seed = 1", "simulate: unknown key, did you mean 'simulation'?"),
         ("'a\\nb'", "seed = 1", "a\\nb: unknown key, expected one of frame, catalogue"),
     ],
@@ -293,6 +303,22 @@ def test_resolve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert resolve("none.fits", run_file) == runs / "none.fits"
     assert resolve(data / "data.fits", run_file) == data / "data.fits"
     assert resolve(str(data / "none.fits"), run_file) == data / "none.fits"
+
+
+def test_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "runs"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "inner").symlink_to("sub")
+    (folder / "outer").symlink_to(tmp_path)
+    (folder / "up.h5").symlink_to(tmp_path / "a.h5")
+    (folder / "circle").symlink_to("circle")
+    for path in ("a.h5", "sub/a.h5", "sub/../a.h5", "inner/a.h5", f"{folder}/a.h5", "outer/runs/a.h5"):
+        assert within(folder, path, "where") == folder / path
+    for path in ("../a.h5", "sub/../../a.h5", "outer/a.h5", "up.h5", "circle/a.h5", f"{tmp_path}/a.h5", "/a.h5", "a\0.h5"):
+        with pytest.raises(InputError, match=r"^where: got .*, which leads out of .*runs, expected a path that stays inside$"):
+            within(folder, path, "where")
+    monkeypatch.chdir(folder)
+    assert within(".", "a.h5", "where") == Path("a.h5")
 
 
 def test_resolve_says_where_it_looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

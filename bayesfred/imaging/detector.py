@@ -30,6 +30,9 @@ PIXELS = ("impulse", "box")
 # of the peak, even where the distortion narrows a spot 1.3 times: see `_box_order`.
 BOX_TOLERANCE = 2e-8
 
+# Points along a pixel's side beyond which nobody waits for the sum over their square.
+MOST_POINTS = 1000
+
 
 @dataclass(frozen=True)
 class Detector:
@@ -120,7 +123,7 @@ class Detector:
         Raises
         ------
         InputError
-            If `sigma` is not a finite number > 0.
+            If `sigma` is not a finite number > 0, or so small that a pixel would take more than `MOST_POINTS` points a side.
 
         Examples
         --------
@@ -169,7 +172,12 @@ def _box_order(width: float) -> int:
     order, bound = 0, 1.0
     while order == 0 or bound > BOX_TOLERANCE:
         order += 1
-        bound *= width**2 * order / (8.0 * (4 * order**2 - 1))
+        if order > MOST_POINTS:
+            raise InputError(
+                f"psf: sigma: got pixels of {width:.3g} sigma with pixel = 'box', expected few enough to integrate over with "
+                f"{MOST_POINTS} points a side: widen the PSF or bin less"
+            )
+        bound *= width * width * order / (8.0 * (4 * order**2 - 1))
     return order
 
 

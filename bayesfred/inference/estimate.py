@@ -141,12 +141,17 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
         n_evaluations += 1
         return -float(posterior.log_prob(place(z)))
 
+    def curvature(z: Floats) -> Floats:
+        matrix = whiten.T @ posterior.information(place(z)) @ whiten
+        # NaN where there is no density; scipy asks there too, before it steps back
+        return matrix if np.isfinite(matrix).all() else np.eye(z.size)
+
     result = optimize.minimize(
         cost,
         np.zeros(origin.size),
         method="trust-exact",
         jac=lambda z: -(whiten.T @ posterior.gradient(place(z))),
-        hess=lambda z: whiten.T @ posterior.information(place(z)) @ whiten,
+        hess=curvature,
         options={"gtol": 1e-7, "maxiter": 300, "initial_trust_radius": 100.0, "max_trust_radius": 1e6},
     )
     params = place(result.x)

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.errors import printable
 from bayesfred.inference.chainfile import Chain
 from bayesfred.inference.posterior import Posterior
 from bayesfred.reporting import plots
@@ -221,7 +222,7 @@ def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats,
 def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     n_ensembles, n_steps, n_walkers, d = chain.chain.shape
     return [
-        ("chain file", str(chain.path)),
+        ("chain file", printable(str(chain.path))),
         ("seed", str(chain.seed)),
         ("sampler", f"{n_ensembles} ensembles of {n_walkers} walkers"),
         ("steps", f"{n_steps}, {chain.burn_in} of them burn-in"),

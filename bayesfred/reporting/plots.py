@@ -252,8 +252,7 @@ def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) 
     -------
     Figure
     """
-    height = TRIPTYCH_MARGIN + TRIPTYCH_SIDE * counts.shape[0] / counts.shape[1]
-    fig = Figure(figsize=(19, height), dpi=100, layout="constrained")
+    fig = Figure(figsize=(19, _triptych_height(counts)), dpi=100, layout="constrained")
     _draw_triptych(fig, fig.subplots(1, 3), counts, expected, sigma, mask)
     return fig
 
@@ -321,6 +320,12 @@ def star_panels(
     return fig
 
 
+def _triptych_height(counts: Floats) -> float:
+    """Inches that three frames side by side need; a strip of a frame gets a band around it."""
+    ny, nx = counts.shape
+    return TRIPTYCH_MARGIN + TRIPTYCH_SIDE * min(max(float(ny / nx), 0.25), 2.0)
+
+
 def overview(
     counts: Floats,
     expected: Floats,
@@ -353,7 +358,7 @@ def overview(
     sd = np.where(sd > 0.0, sd, 1.0)
     kept = [k for k, name in enumerate(names) if truth is not None or name.startswith(("f_", "g_"))]
     z = (mean if truth is None else mean - truth)[kept] / sd[kept]
-    heights = (TRIPTYCH_MARGIN + TRIPTYCH_SIDE * counts.shape[0] / counts.shape[1], 3.4)
+    heights = (_triptych_height(counts), 3.4)
     fig = Figure(figsize=(19, sum(heights)), dpi=100, layout="constrained")
     parts: Any = fig.subfigures(2, 1, height_ratios=heights)  # an array, whatever the stubs of the version say
     upper, lower = parts

@@ -1,0 +1,101 @@
+"""From the settings of a run file to the objects that they describe."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred import files, settings
+from bayesfred.errors import InputError, printable
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.imaging.scene import SourceCatalog
+from bayesfred.inference import priors
+from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
+from bayesfred.inference.posterior import Nuisances, Posterior
+
+Floats = npt.NDArray[np.float64]
+
+# Share of the frame's half-width by which images may stand away from their sources: three standard deviations of a term's default
+# prior. Sources whose light is farther from the frame than that are left out.
+STRAY = 0.3
+
+
+def catalogue(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) -> tuple[SourceCatalog, str]:
+    """The catalogue's sources whose light can reach the frame, and a line that counts them.
+
+    A source is at the edge if the frame's border is within three widths of the PSF, or between it and the frame; and outside if
+    no light reaches the frame from an image that stands `STRAY` nearer. If all are outside, all are kept: the posterior says so.
+    """
+    c, path = run.catalogue, settings.resolve(run.catalogue.path, run_file, must_exist=True)
+    record = files.read_catalogue(path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point)
+    half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
+    tolerance = run.model.tolerance
+    reach = run.psf.sigma * math.sqrt(-2.0 * math.log(tolerance)) if tolerance > 0 else math.inf
+    beyond = np.abs([record.x, record.y]) - half  # pixels, negative inside
+    outside = (beyond > reach + STRAY * half).any(axis=0)
+    kept = ~outside if not outside.all() else outside
+    at_edge = kept & (beyond > -3.0 * run.psf.sigma).any(axis=0)
+    numbers = f"{len(record.x)} sources, {at_edge.sum()} at the frame's edge, {(~kept).sum()} outside left out"
+    return SourceCatalog(record.x[kept], record.y[kept], record.flux[kept]), f"{printable(path.name)}: {numbers}"
+
+
+def forward_model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog) -> ForwardModel:
+    """The forward model of [detector], [psf], [distortion] and [model]."""
+    d = run.distortion
+    if d.terms is None:
+        distortion = PolynomialDistortion(d.f_terms or (), d.g_terms or ())
+    elif d.degree is not None:
+        distortion = PolynomialDistortion.complete(d.degree)
+    else:
+        distortion = getattr(PolynomialDistortion, d.terms)()
+    detector = Detector(shape, binning=run.detector.binning, pixel=run.detector.pixel)
+    m = run.model
+    return ForwardModel(
+        detector, sources, GaussianPSF(run.psf.sigma), distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance
+    )
+
+
+def noise_model(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
+    """The noise of [noise]."""
+    return BackgroundNoise() if run.noise.kind == "background" else PoissonNoise(run.noise.read_noise)
+
+
+def posterior_given(
+    run: settings.RunSettings, model: ForwardModel, counts: Floats, mask: npt.NDArray[np.bool_] | None
+) -> Posterior:
+    """The posterior of a frame with the nuisances and priors of the run file."""
+    n = run.nuisances
+    nuisances = Nuisances(n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint, n.position_scatter)
+    prior = {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
+    return Posterior(model, counts, prior=prior, noise=noise_model(run), mask=mask, nuisances=nuisances)
+
+
+def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:
+    """A simulated frame's posterior and the true parameters."""
+    s = run.simulation
+    assert s is not None, "checked by the callers"
+    files.require_memory(f"{run_file}: simulation.shape", s.shape)
+    if s.grid:
+        sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)
+    else:
+        sources, _ = catalogue(run, run_file, s.shape)
+    model = forward_model(run, s.shape, sources)
+    unknown = sorted(set(s.theta) - set(model.distortion.names))
+    if unknown:
+        raise InputError(
+            f"{run_file}: simulation.theta: got {', '.join(unknown)}, expected names among {', '.join(model.distortion.names)}"
+        )
+    theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
+    noise = noise_model(run)
+    counts = simulate(model, theta, s.background, seed=seed, noise=noise)
+    posterior = posterior_given(run, model, counts, None)
+    known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
+    known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
+    truth = np.array([known.get(name, 0.0) for name in posterior.parameter_names])
+    if not np.all(np.isfinite(posterior.expected_counts(truth))):
+        raise InputError(f"{run_file}: simulation.theta: got a distortion that folds a source's image, expected a weaker one")
+    return posterior, truth
