@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from bayesfred import assembly, files, settings
@@ -200,7 +201,7 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> bool:
     checks = verification.verify(Path(chain_file), every_draw=every_draw)
     table = Table("what", "finding", "holds")
     for check in checks:
-        table.add_row(check.what, check.finding, "yes" if check.holds else "no")
+        table.add_row(check.what, escape(check.finding), "yes" if check.holds else "no")
     Console(width=None if sys.stdout.isatty() else 120).print(table)
     made = open_chain(chain_file).versions
     others = [f"{name} {made.get(name)} (here {here})" for name, here in versions().items() if made.get(name) != here]

@@ -918,6 +918,22 @@ def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.
     assert "Traceback" not in output.stdout
 
 
+def test_log_probabilities_that_are_no_numbers_are_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log_prob = Posterior.unchecked_log_prob
+
+    def spoilt(posterior: Posterior, params: NDArray[np.float64]) -> NDArray[np.float64]:
+        values = log_prob(posterior, params)
+        if len(params) == 16:  # half an ensemble, in a step
+            values[:2] = np.nan, np.inf
+        return values
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", spoilt)
+    sections(sampling=FEW_STEPS)(folder)
+    output = invoke(folder, "fit", "run.toml")
+    assert output.code == 3
+    assert f"\n{12 * 4 * 2 * 2} log-probabilities were NaN or infinite and taken as -inf" in output.stdout
+
+
 def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt

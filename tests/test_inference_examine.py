@@ -222,6 +222,11 @@ def reference_attribute(file: h5py.File) -> None:
     file["versions"].attrs["numpy"] = file["/"].ref
 
 
+@harm("/versions/?[31m red?: got a soft")
+def name_that_a_terminal_obeys(file: h5py.File) -> None:
+    file["versions/\x1b[31m\nred\x07"] = h5py.SoftLink("/")
+
+
 @harm("neither a group nor an array")
 def named_type(file: h5py.File) -> None:
     file["versions/type"] = np.dtype("f8")
@@ -343,6 +348,10 @@ SENSELESS: dict[str, Harm] = {
     "no ensembles": lambda file: file.attrs.update(ensembles=0),
     "seed": lambda file: file.attrs.update(seed=np.nan),
     "names": lambda file: file.attrs.update(parameter_names=np.zeros(13)),
+    "names of markup": lambda file: file.attrs.update(parameter_names=np.array([b"[/x]"] * 13)),
+    "version that a terminal obeys": lambda file: file["versions"].attrs.update(numpy=np.bytes_(b"\x1b[31m")),
+    "version of markup": lambda file: file["versions"].attrs.update({"[/x]": np.bytes_(b"1")}),
+    "message of two lines": lambda file: file["estimate"].attrs.update(message=np.bytes_(b"a\nb")),
     "no target": lambda file: file.attrs.__delitem__("target_ess"),
 }
 

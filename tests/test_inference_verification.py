@@ -114,6 +114,15 @@ def test_what_was_changed_is_found(path: Path, name: str) -> None:
     assert found >= wrong
 
 
+def test_an_estimate_that_no_run_can_have_started_from_is_found(path: Path) -> None:
+    with h5py.File(path, "a") as file:
+        file["estimate/covariance"][()] = -file["estimate/covariance"][()]
+    reseal(path)
+    wrong = {check.what: check.finding for check in verify(path) if not check.holds}
+    assert set(wrong) == {"covariance", "first steps"}
+    assert "no positive definite covariance" in wrong["first steps"]
+
+
 def test_a_posterior_that_is_not_rebuilt_as_it_was_is_found(path: Path) -> None:
     with h5py.File(path, "a") as file:
         file["posterior/noise"].attrs["colour"] = 1.0  # which nothing reads

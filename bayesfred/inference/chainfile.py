@@ -164,7 +164,8 @@ def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, 
         chain.estimate.write(file.create_group("estimate"))
         for k, state in enumerate(states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
-    _replace(chain.path, content.getbuffer())
+    with content.getbuffer() as written:
+        _replace(chain.path, written)
 
 
 def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) -> None:
@@ -230,6 +231,10 @@ def _read(path: Path, file: h5py.File) -> Chain:
         raise ValueError("shapes that do not agree")
     if {int(g.attrs["iteration"]) for g in groups} != {shape[1]} or not 0 <= chain.burn_in < shape[1]:
         raise ValueError("numbers of steps that do not agree")
+    if not all(name.isidentifier() for name in (*chain.parameter_names, *chain.versions)):
+        raise ValueError("names that are none")
+    if not all(text.isprintable() for text in (chain.estimate.message, *chain.versions.values())):
+        raise ValueError("texts that cannot be shown")
     return chain
 
 

@@ -20,6 +20,7 @@ Floats = npt.NDArray[np.float64]
 
 DE_SHARE = 0.05  # of the steps move by differential evolution
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
+DEPENDENT = 1e-8  # share of the largest spread, in standard deviations, below which there is none in a direction
 
 
 class Step(NamedTuple):
@@ -115,7 +116,7 @@ def check_start(names: tuple[str, ...], start: Step) -> None:
                 "see the estimate's covariance"
             )
         standardised = (coords - coords.mean(axis=0)) / coords.std(axis=0)
-        rank, full = np.linalg.matrix_rank(standardised), min(len(coords) - 1, len(names))
+        rank, full = np.linalg.matrix_rank(standardised, rtol=DEPENDENT), min(len(coords) - 1, len(names))
         if rank < full:
             raise InputError(
                 f"start: got walkers that spread in {rank} directions only, expected {full}: see the estimate's covariance"

@@ -73,10 +73,15 @@ def examined(path: Path) -> Iterator[h5py.File]:
                 _check_tree(file.id, size)
                 yield file
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{path}: {_shown(error)}") from None
     except (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: damaged ({reason}), expected a whole chain file: {MEND}") from None
+        raise InputError(f"{path}: damaged ({_shown(error)}), expected a whole chain file: {MEND}") from None
+
+
+def _shown(error: Exception) -> str:
+    """What an error says, on one line and without what a terminal would obey; names in a file are anybody's."""
+    text = " ".join(str(error).split())
+    return "".join(c if c.isprintable() else "?" for c in text)[:400]
 
 
 def _check_seal(stream: BinaryIO) -> int:
@@ -121,7 +126,7 @@ def _check_tree(root: Any, size: int) -> None:
                 raise InputError(f"{name}: got arrays larger than the file, expected them to lie in it: {MEND}")
             continue
         if number + len(todo) + node.get_num_objs() > MOST_OBJECTS:
-            raise InputError(f"{name or '/'}: got more than {MOST_OBJECTS} objects, expected those of a chain: {MEND}")
+            raise InputError(f"got more than {MOST_OBJECTS} objects, expected those of a chain: {MEND}")
         for key in node:
             child = f"{name}/{key.decode(errors='replace')}"
             if node.links.get_info(key).type != h5l.TYPE_HARD:

@@ -1,7 +1,7 @@
 """One writer a chain file: a lock that says who holds it.
 
 The lock is the operating system's, which frees it when its holder dies. Who holds it stands in a file beside it, because
-the lock file itself is emptied by those who try.
+not every version of filelock leaves the content of the lock file alone.
 """
 
 import os
@@ -57,7 +57,8 @@ def only_writer(path: Path) -> Iterator[None]:
 def _told(holder: Path) -> str:
     """What the holder says of itself, in a form that can be shown."""
     try:
-        text = holder.read_text(encoding="utf-8", errors="replace")[:200]
+        with open(holder, encoding="utf-8", errors="replace") as stream:
+            text = stream.read(200)
     except OSError:
         return ""
     return f" ({''.join(c for c in text if c.isprintable())})"

@@ -115,9 +115,12 @@ def _maximum(chain: Chain, posterior: Posterior) -> list[Check]:
 def _steps(chain: Chain, posterior: Posterior) -> list[Check]:
     """The first steps made again, and the numbers of accepted moves, for which the first step is needed."""
     ensembles, n_steps, walkers = chain.log_prob.shape
-    start = begin(posterior, chain.estimate, chain.seed, ensembles, walkers)
-    with threadpool_limits(1, user_api="blas"):
-        steps = list(islice(advance(posterior, chain.estimate, start), min(STEPS, n_steps)))
+    try:
+        start = begin(posterior, chain.estimate, chain.seed, ensembles, walkers)
+        with threadpool_limits(1, user_api="blas"):
+            steps = list(islice(advance(posterior, chain.estimate, start), min(STEPS, n_steps)))
+    except InputError as error:
+        return [Check("first steps", str(error), False)]
     again, stored = np.stack([s.coords for s in steps], axis=1), chain.chain[:, : len(steps)]
     off = np.abs(again - stored) / np.sqrt(np.diag(chain.estimate.covariance))
     wrong = np.flatnonzero(~(off.max(axis=(0, 2, 3)) <= ROUNDING))
