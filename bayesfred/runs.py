@@ -257,7 +257,8 @@ def _fit(
     if not output.parent.is_dir():
         raise InputError(f"{output}: no folder {output.parent}, expected one to write the chain to: create it")
     page, picture = _beside(output)
-    for path in (output, page, picture, output.with_name(f".{output.name}.lock")):
+    hidden = (output.with_name(f".{output.name}.{kind}") for kind in ("lock", "tmp", "writer"))
+    for path in (output, page, picture, *hidden):
         if os.path.islink(path) or os.path.isdir(path):
             raise InputError(f"{path}: got a link or a folder, expected a file or nothing there: remove it, or write elsewhere")
     resume = resume and os.path.exists(output)

@@ -19,7 +19,7 @@ from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
 
-HEAVY_SHARE = 0.1
+HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
 
 NESTED = 30  # at most so many approximations to either side

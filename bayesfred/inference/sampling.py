@@ -138,9 +138,11 @@ def _check_numbers(ensembles: int, walkers: int, target_ess: float, steps: int |
 
 
 def burn_in(chain: Floats) -> int:
-    """Steps to leave out: twice the slowest parameter's autocorrelation time, at most half the run.
+    """Steps to leave out, at most half the run.
 
-    Walkers start from the Laplace approximation, so what must be forgotten is its difference from the posterior.
+    Walkers start from the Laplace approximation, so what must be forgotten is its difference from the posterior. Were the slowest
+    parameter's correlations r^k after k steps, its autocorrelation time would be tau = (1 + r)/(1 - r); the steps are those
+    after which a fiftieth is left, r^k = 1/50.
     """
     n_steps = chain.shape[1]
     kept = chain[:, n_steps // 4 :]
@@ -148,7 +150,10 @@ def burn_in(chain: Floats) -> int:
     effective = float(min(bulk.min(), tail.min()))
     draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
     half: int = n_steps // 2
-    return min(half, math.ceil(2.0 * draws / effective)) if effective > 0 else half
+    if not effective > 0:
+        return half
+    tau = max(draws / effective, 1.1)
+    return min(half, math.ceil(math.log(50.0) / math.log((tau + 1.0) / (tau - 1.0))))
 
 
 def versions() -> dict[str, str]:
