@@ -5,10 +5,10 @@ For one source the displacement is a polynomial in (u, v) alone, so the kernel's
     a = u - x + f(u, v, x, y) - offset_x,        b = v - y + g(u, v, x, y) - offset_y
 
 are two small coefficient matrices. They are expanded about the source's peak, where a = b = 0, which makes
-them well conditioned and gives the window of pixels to visit. Along a row of pixels they are polynomials in u
-alone, and so are a^2 + b^2 and the Jacobian determinant D = a_u b_v - a_v b_u: a sample of the kernel costs two Horner
-sweeps and one exponential. The degree in u reaches the innermost loop as the length of a tuple, that is as a
-compile-time constant, so that the loop over pixels vectorises for every degree.
+them well conditioned and gives the window of pixels to visit. So are a^2 + b^2 and the Jacobian determinant
+D = a_u b_v - a_v b_u, multiplied out once per source. Along a row of pixels they are polynomials in u alone: a sample of
+the kernel costs two Horner sweeps and one exponential. The degree in u reaches the innermost loop as the length of a
+tuple, that is as a compile-time constant, so that the loop over pixels vectorises for every degree.
 
 `forward.py` binds these functions to the public objects; the loops over counts are in `inference/_kernels.py`.
 """
@@ -49,18 +49,19 @@ class Optics(NamedTuple):
     ny: int
     nx: int
     cut: float  # -2 log(tolerance)
-    v_degree: int
     ramp: Floats  # (padded row,) u of pixels counted from a row's first
-    u_degree: tuple[int, ...]  # its length is the degree in u of a and b
+    degree: tuple[int, ...]  # its length is the degree of a and b in u or v, whichever is higher
     q_degree: tuple[int, ...]  # of a^2 + b^2
-    d_degree: tuple[int, ...]  # its length is the degree in u of D; empty where flux is not conserved
+    d_degree: tuple[int, ...]  # of D; empty where flux is not conserved
 
 
 class Maps(NamedTuple):
     """Where the sources are imaged and which pixels they reach."""
 
-    a: Floats  # (s, u_degree + 1, v_degree + 1) coefficients about the peak
+    a: Floats  # (s, degree + 1, degree + 1) coefficients about the peak, powers of u first
     b: Floats
+    q: Floats  # (s, q_degree + 1, q_degree + 1) of a^2 + b^2, powers of v first
+    d: Floats  # (s, d_degree + 1, d_degree + 1) of D, or 1 where flux is not conserved
     peak: Floats  # (s, 2) u, v
     ellipse: Floats  # (s, 4) alpha, beta, gamma, R^2: alpha t^2 + 2 beta t w + gamma w^2 <= R^2
     rows: Ints  # (s, 2) first row and the one after the last
@@ -143,17 +144,34 @@ def _fill(o, s, theta, offset_x, offset_y, a, b):
 
 
 @nb.njit(cache=True)
-def _shift(c, h, k):
+def _shift(c, h, k, degree):
     """c(u, v) -> c(u + h, v + k) in place, by repeated synthetic division."""
-    m1, n1 = c.shape
-    for n in range(n1):
-        for i in range(m1 - 1):
-            for m in range(m1 - 2, i - 1, -1):
+    top = len(degree)
+    for n in range(top + 1):
+        for i in range(top):
+            for m in range(top - 1, i - 1, -1):
                 c[m, n] += h * c[m + 1, n]
-    for m in range(m1):
-        for i in range(n1 - 1):
-            for n in range(n1 - 2, i - 1, -1):
+    for m in range(top + 1):
+        for i in range(top):
+            for n in range(top - 1, i - 1, -1):
                 c[m, n] += k * c[m, n + 1]
+
+
+@nb.njit(cache=True, fastmath=FAST)
+def _evaluate(c, u, v, degree):
+    """The polynomial c and its derivatives with respect to u and v."""
+    top = len(degree)
+    value, c_u, c_v = 0.0, 0.0, 0.0
+    for i in range(top + 1):
+        m = top - i
+        row, row_v = c[m, top], 0.0
+        for k in range(top):  # Horner's scheme carries the derivative along
+            row_v = row_v * v + row
+            row = row * v + c[m, top - 1 - k]
+        c_u = c_u * u + value
+        value = value * u + row
+        c_v = c_v * u + row_v
+    return value, c_u, c_v
 
 
 @nb.njit(cache=True)
@@ -164,30 +182,43 @@ def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     far = 4.0 * o.step * (o.nx + o.ny)
     found = False
     _fill(o, s, theta, offset_x, offset_y, a, b)
-    _shift(a, u, v)
-    _shift(b, u, v)
     for _ in range(50):
-        det = a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0]
+        a_0, a_u, a_v = _evaluate(a, u, v, o.degree)
+        b_0, b_u, b_v = _evaluate(b, u, v, o.degree)
+        det = a_u * b_v - a_v * b_u
         if det == 0.0:
             break
-        h = (a[0, 1] * b[0, 0] - b[0, 1] * a[0, 0]) / det
-        k = (b[1, 0] * a[0, 0] - a[1, 0] * b[0, 0]) / det
+        h = (a_v * b_0 - b_v * a_0) / det
+        k = (b_u * a_0 - a_u * b_0) / det
         if not (abs(h) + abs(k) < far):
             break
         u += h
         v += k
-        _shift(a, h, k)
-        _shift(b, h, k)
         if abs(h) + abs(k) <= 1e-9:  # quadratic convergence: the next step would be far below rounding
             found = True
             break
     if not found:
         u = o.x[s]
         v = o.y[s]
-    _fill(o, s, theta, offset_x, offset_y, a, b)  # one shift from the start, free of the steps' rounding
-    _shift(a, u, v)
-    _shift(b, u, v)
+    _shift(a, u, v, o.degree)
+    _shift(b, u, v, o.degree)
     return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
+
+
+@nb.njit(cache=True, fastmath=FAST)
+def _multiply(a, b, conserve, q, d):
+    """Coefficients of a^2 + b^2, and of a_u b_v - a_v b_u if flux is conserved, else of 1."""
+    q[:] = 0.0
+    d[:] = 0.0
+    if not conserve:
+        d[0, 0] = 1.0
+    for m in range(a.shape[0]):
+        for n in range(a.shape[1]):
+            for i in range(a.shape[0]):
+                for j in range(a.shape[1]):
+                    q[n + j, m + i] += a[m, n] * a[i, j] + b[m, n] * b[i, j]
+                    if conserve and m * j != n * i:
+                        d[n + j - 1, m + i - 1] += (m * j - n * i) * a[m, n] * b[i, j]
 
 
 @nb.njit(cache=True)
@@ -234,6 +265,7 @@ def locate(o, theta, offset_x, offset_y, sigma, maps):
         b = maps.b[s]
         u, v, ok = _find_peak(o, s, theta, offset_x, offset_y, a, b)
         unfolded = unfolded and ok
+        _multiply(a, b, len(o.d_degree) > 0, maps.q[s], maps.d[s])
         maps.peak[s, 0] = u
         maps.peak[s, 1] = v
         reach = _reach(o, a, b, sigma) if ok else math.inf
@@ -256,34 +288,10 @@ def locate(o, theta, offset_x, offset_y, sigma, maps):
     return unfolded
 
 
-@nb.njit(cache=True, inline="always")
-def chord(peak, ellipse, j, ny, nx, step):
-    """First pixel and number of pixels of row j that a source reaches; the number is a multiple of LANES."""
-    low = 0
-    high = nx
-    alpha = ellipse[0]
-    if alpha > 0.0:
-        w = (j - 0.5 * (ny - 1)) * step - peak[1]
-        beta = ellipse[1]
-        disc = beta * beta * w * w - alpha * (ellipse[2] * w * w - ellipse[3])
-        if disc < 0.0:
-            return 0, 0
-        middle = peak[0] - beta * w / alpha
-        half = math.sqrt(disc) / alpha
-        centre = 0.5 * (nx - 1)
-        left = min(max((middle - half) / step + centre, 0.0), 1.0 * nx)
-        right = min(max((middle + half) / step + centre, -1.0), nx - 1.0)
-        low = math.ceil(left)
-        high = math.floor(right) + 1
-    if high <= low:
-        return 0, 0
-    return low, -(-(high - low) // LANES) * LANES
-
-
 @nb.njit(cache=True, fastmath=FAST)
-def _row(a, b, w, ra, rb, rav, rbv, u_degree):
+def _row(a, b, w, ra, rb, rav, rbv, degree):
     """Coefficients in t = u - u_peak of a, b, a_v and b_v on the row at v = v_peak + w."""
-    for m in range(len(u_degree) + 1):
+    for m in range(len(degree) + 1):
         pa, pb, pav, pbv = 0.0, 0.0, 0.0, 0.0
         for k in range(a.shape[1]):
             n = a.shape[1] - 1 - k
@@ -295,58 +303,19 @@ def _row(a, b, w, ra, rb, rav, rbv, u_degree):
 
 
 @nb.njit(cache=True, fastmath=FAST)
-def _row_products(ra, rb, rav, rbv, k, amplitude, rq, rd, u_degree, q_degree, d_degree):
-    """Coefficients in t of the exponent k (a^2 + b^2) and of amplitude times D (of amplitude alone, without D)."""
-    size = len(u_degree) + 1
-    for p in range(len(q_degree) + 1):
-        q = 0.0
-        for m in range(size):
-            if 0 <= p - m < size:
-                q += ra[m] * ra[p - m] + rb[m] * rb[p - m]
-        rq[p] = k * q
-    rd[0] = amplitude
-    if len(d_degree) > 0:
-        for p in range(len(d_degree) + 1):
-            d = 0.0
-            for m in range(1, size):
-                if 0 <= p + 1 - m < size:
-                    d += m * (ra[m] * rbv[p + 1 - m] - rb[m] * rav[p + 1 - m])
-            rd[p] = amplitude * d
+def _along(c, w, factor, out, degree):
+    """Coefficients in t of factor times the polynomial with coefficients c[n, m] of w^n t^m."""
+    top = len(degree)
+    for m in range(top + 1):
+        p = c[top, m]
+        for n in range(top):
+            p = p * w + c[top - 1 - n, m]
+        out[m] = factor * p
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _add_row(row, ramp, t0, rq, rd, q_degree, d_degree):
-    """row[i] += 2^q(t) |d(t)| at t = t0 + ramp[i], q and d given by their coefficients."""
-    q_top = len(q_degree)
-    d_top = len(d_degree)
-    for i in range(row.size):
-        t = t0 + ramp[i]
-        q = rq[q_top]
-        for m in range(q_top):
-            q = q * t + rq[q_top - 1 - m]
-        d = rd[d_top]
-        for m in range(d_top):
-            d = d * t + rd[d_top - 1 - m]
-        row[i] += exp2(q) * abs(d)
-
-
-@nb.njit(cache=True, inline="always")
-def add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, amplitude, work, u_degree, q_degree, d_degree):
-    """Add a source's counts to a row of pixels whose first centre is (t, w) from the peak."""
-    ra, rb, rav, rbv, rq, rd = work[0], work[1], work[2], work[3], work[4], work[5]
-    k = -0.5 * LOG2_E / (sigma * sigma)
-    norm = amplitude / (2.0 * math.pi * sigma * sigma)
-    for q in range(offsets.size):
-        _row(a, b, w + offsets[q], ra, rb, rav, rbv, u_degree)
-        for p in range(offsets.size):
-            weight = norm * weights[q] * weights[p]
-            _row_products(ra, rb, rav, rbv, k, weight, rq, rd, u_degree, q_degree, d_degree)
-            _add_row(row, ramp, t + offsets[p], rq, rd, q_degree, d_degree)
-
-
-@nb.njit(cache=True)
 def footprints(o, maps):
-    """The rows of pixels that every source reaches."""
+    """The rows of pixels that every source reaches, their lengths multiples of LANES."""
     size = 0
     for s in range(o.x.size):
         size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
@@ -356,10 +325,22 @@ def footprints(o, maps):
     ny, nx, step = o.ny, o.nx, o.step
     i = 0
     for s in range(o.x.size):
-        peak, ellipse = maps.peak[s], maps.ellipse[s]
+        alpha, beta, gamma, square = maps.ellipse[s, 0], maps.ellipse[s, 1], maps.ellipse[s, 2], maps.ellipse[s, 3]
+        # In columns, row v_peak + w has its chord's middle at middle + slope w, and half the chord squared is half - bend w^2.
+        middle, slope, half, bend = 0.0, 0.0, 1.0 * nx * nx, 0.0
+        if alpha > 0.0:
+            middle = maps.peak[s, 0] / step + 0.5 * (nx - 1)
+            slope = -beta / (alpha * step)
+            half = square / (alpha * step * step)
+            bend = (alpha * gamma - beta * beta) / (alpha * step) ** 2
+        top = maps.peak[s, 1] + 0.5 * (ny - 1) * step
         for j in range(maps.rows[s, 0], maps.rows[s, 1]):
-            at, n = chord(peak, ellipse, j, ny, nx, step)
+            w = j * step - top
+            reach = math.sqrt(max(half - bend * w * w, 0.0))
+            at = math.ceil(min(max(middle + slope * w - reach, 0.0), 1.0 * nx))
+            n = math.floor(min(max(middle + slope * w + reach, -1.0), nx - 1.0)) + 1 - at
             if n > 0:
+                n = -(-n // LANES) * LANES
                 low[i], count[i], row[i] = at, n, j
                 start[i + 1] = start[i] + n
                 i += 1
@@ -368,33 +349,60 @@ def footprints(o, maps):
 
 
 @nb.njit(cache=True)
-def add_source(o, maps, fp, s, sigma, flux, out, work):
-    """Add source s to the padded, flattened image `out`."""
-    # What the rows share is taken out of the tuples once: handing them on costs more than a short row.
-    a, b, u, v = maps.a[s], maps.b[s], maps.peak[s, 0], maps.peak[s, 1]
-    offsets, weights, step, ny, nx, ramp = o.offsets, o.weights, o.step, o.ny, o.nx, o.ramp
-    pitch = out.size // ny
+def row_starts(fp, pitch):
+    """Where every row of pixels begins in a padded, flattened image."""
+    at = np.empty(fp.row.size, np.int64)
+    for i in range(at.size):
+        at[i] = fp.row[i] * pitch + fp.low[i]
+    return at
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+def add_source(o, maps, fp, s, sigma, flux, at, out, work):
+    """Add source s to `out`, the samples of row i from at[i] on."""
+    # What the rows share is taken out of the tuples once, and the loop over pixels stays in this function: a call costs more
+    # than a short row.
+    q, d, u, v = maps.q[s], maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
+    offsets, weights, step, lows, rows, sizes = o.offsets, o.weights, o.step, fp.low, fp.row, fp.size
+    middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
+    rq, rd, ramp = work[0], work[1], o.ramp
+    q_top, d_top = len(o.q_degree), len(o.d_degree)
+    k = -0.5 * LOG2_E / (sigma * sigma)
+    norm = flux / (2.0 * math.pi * sigma * sigma)
     for i in range(fp.first[s], fp.first[s + 1]):
-        low, j = fp.low[i], fp.row[i]
-        start = j * pitch + low
-        w = (j - 0.5 * (ny - 1)) * step - v
-        t = (low - 0.5 * (nx - 1)) * step - u
-        row = out[start : start + fp.size[i]]
-        add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, flux, work, o.u_degree, o.q_degree, o.d_degree)
+        w = (rows[i] - middle_v) * step - v
+        t_low = (lows[i] - middle_u) * step - u
+        row = out[at[i] : at[i] + sizes[i]]
+        for y in range(offsets.size):
+            _along(q, w + offsets[y], k, rq, o.q_degree)
+            for x in range(offsets.size):
+                _along(d, w + offsets[y], norm * weights[y] * weights[x], rd, o.d_degree)
+                t0 = t_low + offsets[x]
+                for n in range(row.size):
+                    t = t0 + ramp[n]
+                    e = rq[q_top]
+                    for m in range(q_top):
+                        e = e * t + rq[q_top - 1 - m]
+                    j = rd[d_top]
+                    for m in range(d_top):
+                        j = j * t + rd[d_top - 1 - m]
+                    row[n] += exp2(e) * abs(j)
 
 
 @nb.njit(cache=True)
 def new_maps(o):
     """Room for the maps of all sources."""
     size = o.x.size
-    shape = (size, len(o.u_degree) + 1, o.v_degree + 1)
-    return Maps(np.empty(shape), np.empty(shape), np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
+    n, n_q, n_d = len(o.degree) + 1, len(o.q_degree) + 1, len(o.d_degree) + 1
+    a, b = np.empty((size, n, n)), np.empty((size, n, n))
+    q, d = np.empty((size, n_q, n_q)), np.empty((size, n_d, n_d))
+    return Maps(a, b, q, d, np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
 
 
 @nb.njit(cache=True)
 def new_work(o):
     """Room for a row's polynomials."""
-    return np.empty((7, 2 * len(o.u_degree) + 2))
+    return np.empty((7, 2 * len(o.degree) + 2))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -404,8 +412,9 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
     work = new_work(o)
     unfolded = locate(o, theta, offset_x, offset_y, sigma, maps)
     fp = footprints(o, maps)
+    at = row_starts(fp, out.size // o.ny)
     for s in range(o.x.size):
-        add_source(o, maps, fp, s, sigma, flux[s], out, work)
+        add_source(o, maps, fp, s, sigma, flux[s], at, out, work)
     return unfolded
 
 
@@ -511,29 +520,30 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
     e, size, signed, along_a, along_b = samples[0, :n], samples[1, :n], samples[2, :n], samples[3, :n], samples[4, :n]
     f_u, f_v, g_u, g_v = samples[5, :n], samples[6, :n], samples[7, :n], samples[8, :n]
     row_k, row_s = out[n_f + n_g], out[n_f + n_g + 1]
-    top = len(o.u_degree)
+    top = len(o.degree)
     slope[:] = 0.0
     for q in range(o.offsets.size):
         v = v_row + o.offsets[q]
-        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.u_degree)
-        _row_products(ra, rb, rav, rbv, k, 1.0, rq, rd, o.u_degree, o.q_degree, o.d_degree)
+        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.degree)
+        _along(maps.q[s], v - maps.peak[s, 1], k, rq, o.q_degree)
+        _along(maps.d[s], v - maps.peak[s, 1], 1.0, rd, o.d_degree)
         for p in range(o.offsets.size):
             u = u_row + o.offsets[p]
             t = u - maps.peak[s, 0]
             _exponential_row(e, ramp, t, rq, norm * o.weights[q] * o.weights[p], o.q_degree)
             _times_polynomial(signed, e, 1.0, ramp, t, rd, o.d_degree)
             _absolute_and_sign(size, signed, e)
-            _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.u_degree)
-            _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.u_degree)
+            _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.degree)
+            _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.degree)
             if conserve:
-                _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.u_degree)
-                _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.u_degree)
+                _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
+                _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.degree)
                 for m in range(top):
                     slope[m] = -(m + 1) * rb[m + 1]
-                _times_polynomial(f_v, signed, 1.0, ramp, t, slope, o.u_degree)
+                _times_polynomial(f_v, signed, 1.0, ramp, t, slope, o.degree)
                 for m in range(top):
                     slope[m] = (m + 1) * ra[m + 1]
-                _times_polynomial(g_v, signed, 1.0, ramp, t, slope, o.u_degree)
+                _times_polynomial(g_v, signed, 1.0, ramp, t, slope, o.degree)
             else:
                 samples[5:] = 0.0
             _add_row_of(row_k, size)
@@ -553,7 +563,7 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
     width = out.shape[2]
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
     samples = np.empty((9, width))
-    powers = np.empty((len(o.u_degree) + 1, width))
+    powers = np.empty((len(o.degree) + 1, width))
     for s in range(o.x.size):
         if maps.rows[s, 0] >= last or maps.rows[s, 1] <= first:
             continue

@@ -39,7 +39,6 @@ from bayesfred.imaging._kernels import (
     Ints,
     Maps,
     add_jacobian_rows,
-    add_pixels,
     add_source,
     as_bits,
     as_float,
@@ -48,6 +47,7 @@ from bayesfred.imaging._kernels import (
     locate,
     new_maps,
     new_work,
+    row_starts,
 )
 
 Flags = npt.NDArray[np.uint8]
@@ -265,12 +265,7 @@ def _stamps(o, maps, fp, sigma):
     out = np.zeros(fp.start[fp.row.size])
     work = new_work(o)
     for s in range(o.x.size):
-        a, b, peak = maps.a[s], maps.b[s], maps.peak[s]
-        for i in range(fp.first[s], fp.first[s + 1]):
-            w = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step - peak[1]
-            t = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step - peak[0]
-            row = out[fp.start[i] : fp.start[i + 1]]
-            add_pixels(row, w, t, a, b, o.offsets, o.weights, o.ramp, sigma, 1.0, work, o.u_degree, o.q_degree, o.d_degree)
+        add_source(o, maps, fp, s, sigma, 1.0, fp.start, out, work)
     return out
 
 
@@ -550,9 +545,10 @@ def _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted)
         extra = _profile(counts, w, fp, boxes, clusters, stamps, background, 0.5 * flux, fitted, factors)
     else:
         work = new_work(o)
+        at = row_starts(fp, w.image.size // o.ny)
         for s in range(o.x.size):
             fitted[s] = nuisances[0] * flux[s]
-            add_source(o, maps, fp, s, sigma, fitted[s], w.image, work)
+            add_source(o, maps, fp, s, sigma, fitted[s], at, w.image, work)
     return extra, fp, boxes, clusters, stamps, factors
 
 
@@ -686,7 +682,7 @@ def gradient(o, counts, w, drawn, sigma, background, free, basis, out, out_backg
     pitch = w.image.size // o.ny
     work = new_work(o)
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, pitch))
-    samples, powers = np.empty((9, pitch)), np.empty((len(o.u_degree) + 1, pitch))
+    samples, powers = np.empty((9, pitch)), np.empty((len(o.degree) + 1, pitch))
     ones, c = np.ones(pitch), np.empty(pitch)
     moments = np.empty(rows.shape[0])
     for s in range(o.x.size):
