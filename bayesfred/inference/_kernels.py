@@ -96,22 +96,23 @@ class Clusters(NamedTuple):
 
 @nb.njit(fastmath=FAST, inline="always")
 def log(x):
-    """log(x) of a positive normal number to 3e-16 (absolute near 1): the mantissa m in [0.7, 1.41] by bits, then 2 artanh."""
+    """log(x) of a positive normal number to 3e-16 (absolute near 1).
+
+    The mantissa m in [0.7, 1.41] by bits, then 2 artanh(s) with s = (m - 1) / (m + 1): 2 s + 2 s^3 p(s^2), p being the polynomial
+    of degree 6 nearest to 1/3 + z/5 + z^2/7 + ... (Remez, 5e-18 of the result).
+    """
     bits = as_bits(x)
     k = (bits - 4604544271217802189) >> 52  # exponent, counted from sqrt(1/2)
     m = as_float(bits - (k << 52))
     s = (m - 1.0) / (m + 1.0)
     z = s * s
-    p = 1.0 / 21.0
-    p = p * z + 1.0 / 19.0
-    p = p * z + 1.0 / 17.0
-    p = p * z + 1.0 / 15.0
-    p = p * z + 1.0 / 13.0
-    p = p * z + 1.0 / 11.0
-    p = p * z + 1.0 / 9.0
-    p = p * z + 1.0 / 7.0
-    p = p * z + 0.2
-    p = p * z + 1.0 / 3.0
+    p = 7.3089406919315180756e-02
+    p = p * z + 7.6657981172986236734e-02
+    p = p * z + 9.0914466202426646721e-02
+    p = p * z + 1.1111105536283593608e-01
+    p = p * z + 1.4285714313200197706e-01
+    p = p * z + 1.9999999999949222791e-01
+    p = p * z + 3.3333333333333348644e-01
     return k * 6.93147180369123816490e-01 + (2.0 * s + (2.0 * s * z * p + k * 1.90821492927058770002e-10))
 
 
@@ -126,22 +127,23 @@ def new_workspace(ny, pitch):
 
 
 @nb.njit(cache=True)
-def _mark(flags, span, per_row, j, low, n):
-    """Mark the segments that n pixels of row j from `low` on lie in."""
-    a = low // SEGMENT
-    b = (low + n - 1) // SEGMENT
-    span[j, 0] = min(span[j, 0], a)
-    span[j, 1] = max(span[j, 1], b)
-    for k in range(j * per_row + a, j * per_row + b + 1):
-        flags[k] = 1
-
-
-@nb.njit(cache=True)
 def _mark_sources(fp, w):
-    flags, span = w.flags, w.span
+    """Mark the segments that the sources' rows of pixels lie in."""
+    flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
     per_row = flags.size // span.shape[0]
-    for i in range(fp.row.size):
-        _mark(flags, span, per_row, fp.row[i], fp.low[i], fp.size[i])
+    pitch = per_row + 1
+    change = np.zeros(span.shape[0] * pitch, np.int64)  # in the number of rows on a segment: two writes for a row of any length
+    for i in range(rows.size):
+        j, a, b = rows[i], lows[i] // SEGMENT, (lows[i] + sizes[i] - 1) // SEGMENT
+        span[j, 0] = min(span[j, 0], a)
+        span[j, 1] = max(span[j, 1], b)
+        change[j * pitch + a] += 1
+        change[j * pitch + b + 1] -= 1
+    for j in range(span.shape[0]):
+        depth = 0
+        for k in range(span[j, 0], span[j, 1] + 1):
+            depth += change[j * pitch + k]
+            flags[j * per_row + k] = depth > 0
 
 
 @nb.njit(cache=True)
@@ -151,7 +153,9 @@ def _mark_counted(counts, w):
     for j in range(w.span.shape[0]):
         for k in range(per_row):
             if counts.segment_pixels[j * per_row + k] > 0.0:
-                _mark(w.flags, w.span, per_row, j, k * SEGMENT, SEGMENT)
+                w.flags[j * per_row + k] = 1
+                w.span[j, 0] = min(w.span[j, 0], k)
+                w.span[j, 1] = max(w.span[j, 1], k)
 
 
 @nb.njit(cache=True)
@@ -191,19 +195,24 @@ def _background_row(background, j, ny):
     return c0, background[1] + v * background[4], background[3]
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
-def _poisson_run(image, values, u, step, c0, c1, c2):
-    """Sum of n log(mu) - mu over the unmasked pixels of a stretch, and how many of these have no positive mu."""
-    total = 0.0
-    impossible = 0.0  # counted, not min(mu): a minimum would keep the loop from vectorising
+@nb.njit(cache=True, fastmath=FAST)
+def _slope_run(image, u, step, c1, c2):
+    """Add the part of the background that varies along a stretch."""
     for i in range(image.size):
         x = u + step * i
-        mu = image[i] + (c0 + x * (c1 + x * c2))
+        image[i] += x * (c1 + x * c2)
+
+
+@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+def _poisson_run(image, values, level):
+    """Sum of n log(mu) - mu over the unmasked pixels of a stretch; MASKED or less if one of these has no positive mu."""
+    total = 0.0
+    for i in range(image.size):
+        mu = image[i] + level
         n = values[i]
-        term = n * log(max(mu, 1e-300)) - mu
+        term = n * log(mu) - mu if mu > 0.0 else MASKED  # neither a branch nor a minimum: the loop would not vectorise
         total += term if n > LIMIT else 0.0
-        impossible += 1.0 if (n > LIMIT and mu <= 0.0) else 0.0
-    return total, impossible
+    return total
 
 
 @nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
@@ -221,8 +230,7 @@ def _log_likelihood(counts, w, background):
     """Log-likelihood of the workspace's image plus the background; what depends on the counts alone is left out."""
     ny = w.span.shape[0]
     per_row = w.flags.size // ny
-    step = 2.0 / counts.nx
-    total, impossible = 0.0, 0.0
+    total = 0.0
     pixels, rest = counts.pixels, counts.total
     for j in range(ny):
         c0, c1, c2 = _background_row(background, j, ny)
@@ -230,13 +238,12 @@ def _log_likelihood(counts, w, background):
         while start >= 0:
             a = (j * per_row + start) * SEGMENT
             b = (j * per_row + stop) * SEGMENT
+            if counts.varies:
+                _slope_run(w.image[a:b], (2 * start * SEGMENT - counts.nx + 1) / counts.nx, 2.0 / counts.nx, c1, c2)
             if counts.kind == POISSON:
-                u = (2 * start * SEGMENT - counts.nx + 1) / counts.nx
-                part, bad = _poisson_run(w.image[a:b], counts.values[a:b], u, step, c0, c1, c2)
-                impossible += bad
+                total += _poisson_run(w.image[a:b], counts.values[a:b], c0)
             else:
-                part = _square_run(w.image[a:b], counts.values[a:b], c0)
-            total += part
+                total += _square_run(w.image[a:b], counts.values[a:b], c0)
             for k in range(j * per_row + start, j * per_row + stop):
                 pixels -= counts.segment_pixels[k]
                 rest -= counts.segment_sum[k]
@@ -249,7 +256,7 @@ def _log_likelihood(counts, w, background):
                 pixels += counts.segment_pixels[k]
                 rest += counts.segment_sum[k]
                 squares += counts.segment_squares[k]
-    if impossible > 0.0 or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
+    if total < LIMIT or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
         return -math.inf
     if counts.kind == GAUSSIAN:
         total += squares - 2.0 * level * rest + level * level * pixels

@@ -317,8 +317,9 @@ class Posterior:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
         vectors = self._vectors(params)
         total = np.zeros(len(vectors))
-        for k, distribution in enumerate(self.prior.values()):
-            total += distribution.logpdf(vectors[:, k])
+        for family, places, parameters in self._families:
+            for values in family.logpdf(vectors[:, places], *parameters).T:
+                total += values
         return total
 
     def gradient(self, params: npt.ArrayLike) -> Floats:
@@ -462,6 +463,10 @@ class Posterior:
         """Where each parameter stands among source parameters followed by background coefficients."""
         kernel = (*self.model.distortion.names, *self.nuisances.source_names, *self.nuisances.background_names)
         return [kernel.index(name) for name in self.parameter_names]
+
+    @cached_property
+    def _families(self) -> list[tuple[Any, list[int], Floats]]:
+        return priors.families(self.prior)
 
     @cached_property
     def _optics(self) -> Optics:
