@@ -6,7 +6,7 @@ derivatives are in `_kernels.py`; `estimate.py` finds the maximum, `sampling.py`
 
 import os
 import queue
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -315,12 +315,7 @@ class Posterior:
 
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
-        vectors = self._vectors(params)
-        total = np.zeros(len(vectors))
-        for family, places, parameters in self._families:
-            for values in family.logpdf(vectors[:, places], *parameters).T:
-                total += values
-        return total
+        return self._log_prior(self._vectors(params))
 
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
@@ -465,8 +460,8 @@ class Posterior:
         return [kernel.index(name) for name in self.parameter_names]
 
     @cached_property
-    def _families(self) -> list[tuple[Any, list[int], Floats]]:
-        return priors.families(self.prior)
+    def _log_prior(self) -> Callable[[Floats], Floats]:
+        return priors.log_density(self.prior)
 
     @cached_property
     def _optics(self) -> Optics:
