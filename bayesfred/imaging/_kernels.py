@@ -249,7 +249,7 @@ def _reach(o, a, b, sigma):
                 if m + n >= 2:
                     rest += math.hypot(a[m, n], b[m, n]) * d ** (m + n)
         if radius + rest <= reach * (1.0 + 1e-6):
-            return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * np.max(np.abs(o.offsets))
+            return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * abs(o.offsets[0])
         reach = radius + rest
         if reach > 4.0 * radius:
             break
@@ -402,7 +402,7 @@ def new_maps(o):
 @nb.njit(cache=True)
 def new_work(o):
     """Room for a row's polynomials."""
-    return np.empty((7, 2 * len(o.degree) + 2))
+    return np.empty((7, 2 * len(o.degree) + 1))
 
 
 @nb.njit(cache=True, nogil=True)

@@ -284,17 +284,34 @@ def _boxes(fp):
     for s in range(size):
         a, b = fp.first[s], fp.first[s + 1]
         if b > a:
-            boxes[s, 0], boxes[s, 1] = fp.row[a], fp.row[b - 1] + 1
-            boxes[s, 2], boxes[s, 3] = np.min(fp.low[a:b]), np.max(fp.low[a:b] + fp.size[a:b])
+            boxes[s, 0], boxes[s, 1], boxes[s, 2] = fp.row[a], fp.row[b - 1] + 1, fp.low[a]
+            for i in range(a, b):
+                boxes[s, 2] = min(boxes[s, 2], fp.low[i])
+                boxes[s, 3] = max(boxes[s, 3], fp.low[i] + fp.size[i])
     return boxes
 
 
 @nb.njit(cache=True)
-def _clusters(boxes):
+def _group(keys, size):
+    """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
+    first = np.zeros(size + 2, np.int64)
+    for i in range(keys.size):
+        first[keys[i] + 2] += 1
+    for k in range(size):
+        first[k + 1] += first[k]
+    order = np.empty(keys.size, np.int64)
+    for i in range(keys.size):  # after which first[k + 1] has moved from the beginning of key k to its end
+        order[first[keys[i] + 1]] = i
+        first[keys[i] + 1] += 1
+    return order, first[:-1]
+
+
+@nb.njit(cache=True)
+def _clusters(boxes, ny):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
     parent = np.arange(size)
-    order = np.argsort(boxes[:, 0], kind="mergesort")
+    order = _group(boxes[:, 0], ny)[0]
     for i in range(size):
         s = order[i]
         for k in range(i + 1, size):
@@ -321,14 +338,10 @@ def _clusters(boxes):
             groups += 1
         else:
             label[s] = label[p]
-    members = np.argsort(label, kind="mergesort")
-    first = np.zeros(groups + 1, np.int64)
-    for s in range(size):
-        first[label[s] + 1] += 1
+    members, first = _group(label, groups)
     start = np.zeros(groups + 1, np.int64)
     for c in range(groups):
-        start[c + 1] = start[c] + first[c + 1] ** 2
-        first[c + 1] += first[c]
+        start[c + 1] = start[c] + (first[c + 1] - first[c]) ** 2
     return Clusters(members, first, start)
 
 
@@ -531,59 +544,13 @@ def _profile(counts, w, fp, boxes, clusters, stamps, background, scale, flux, fa
     return value
 
 
-@nb.njit(cache=True)
-def _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fitted):
-    """Put all sources into the workspace's image, profiling their fluxes into `fitted` if they are free.
-
-    Returns what the profiling adds to the log-likelihood, and what it knows of the sources: their footprints, boxes,
-    clusters, stamps and Cholesky factors (empty where fluxes are fixed).
-    """
-    fp = footprints(o, maps)
-    _mark_sources(fp, w)
-    if counts.varies:
-        _mark_counted(counts, w)
-    sigma = nuisances[3]
-    extra = 0.0
-    boxes = _boxes(fp)
-    clusters = _clusters(boxes[: boxes.shape[0] if free else 0])
-    stamps = _stamps(o, maps, fp, sigma) if free else np.empty(0)
-    factors = np.empty(clusters.start[-1])
-    if free:
-        extra = _profile(counts, w, fp, boxes, clusters, stamps, background, 0.5 * flux, fitted, factors)
-    else:
-        work = new_work(o)
-        at = row_starts(fp, w.image.size // o.ny)
-        for s in range(o.x.size):
-            fitted[s] = nuisances[0] * flux[s]
-            add_source(o, maps, fp, s, sigma, fitted[s], at, w.image, work)
-    return extra, fp, boxes, clusters, stamps, factors
-
-
-@nb.njit(cache=True)
-def _log_likelihood_at(o, counts, w, theta, nuisances, background, flux, free):
-    """Log-likelihood for one set of parameters; nuisances are flux_scale, offset_x, offset_y, psf_sigma."""
-    maps = new_maps(o)
-    if not locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps):
-        return -math.inf
-    value = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, np.empty(flux.size))[0]
-    if value > -math.inf:
-        value += _log_likelihood(counts, w, background)
-    clear(w)
-    return value
-
-
-@nb.njit(cache=True, nogil=True)
-def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, first, step, out):
-    """Log-likelihoods of rows first, first + step, ... into `out`; rows where it is -inf already are left alone."""
-    for i in range(first, out.size, step):
-        if out[i] > -math.inf:
-            out[i] = _log_likelihood_at(o, counts, w, theta[i], nuisances[i], background[i], flux, free)
-
-
 class Drawn(NamedTuple):
-    """The sources as they are drawn in a workspace's image, and what the derivatives need of them."""
+    """The sources as they are drawn in a workspace's image, and what the derivatives need of them.
 
-    possible: bool  # False where a map folds, or the fluxes have no maximum
+    Boxes, clusters, stamps and Cholesky factors are empty where fluxes are fixed.
+    """
+
+    extra: float  # what profiling adds to the log-likelihood; -inf where a map folds, or the fluxes have no maximum
     maps: Maps
     footprints: Footprints
     boxes: Ints
@@ -595,14 +562,45 @@ class Drawn(NamedTuple):
 
 @nb.njit(cache=True, nogil=True)
 def draw(o, counts, w, theta, nuisances, background, flux, free):
-    """Draw all sources; whoever uses the image clears the workspace."""
+    """Draw all sources, profiling their fluxes if they are free; whoever uses the image clears the workspace.
+
+    Nuisances are flux_scale, offset_x, offset_y, psf_sigma.
+    """
     maps = new_maps(o)
-    possible = locate(o, theta, nuisances[1], nuisances[2], nuisances[3], maps)
-    if not possible:
+    sigma = nuisances[3]
+    extra = 0.0
+    if not locate(o, theta, nuisances[1], nuisances[2], sigma, maps):
+        extra = -math.inf
         maps.rows[:] = 0
     fluxes = np.empty(flux.size)
-    extra, fp, boxes, clusters, stamps, factors = _draw_sources(o, counts, w, maps, nuisances, background, flux, free, fluxes)
-    return Drawn(possible and extra > -math.inf, maps, fp, boxes, clusters, stamps, factors, fluxes)
+    fp = footprints(o, maps)
+    _mark_sources(fp, w)
+    if counts.varies:
+        _mark_counted(counts, w)
+    boxes = _boxes(fp) if free else np.empty((0, 4), np.int64)
+    clusters = _clusters(boxes, o.ny)
+    stamps = _stamps(o, maps, fp, sigma) if free else np.empty(0)
+    factors = np.empty(clusters.start[-1])
+    if free:
+        extra += _profile(counts, w, fp, boxes, clusters, stamps, background, 0.5 * flux, fluxes, factors)
+    else:
+        work = new_work(o)
+        at = row_starts(fp, w.image.size // o.ny)
+        for s in range(o.x.size):
+            fluxes[s] = nuisances[0] * flux[s]
+            add_source(o, maps, fp, s, sigma, fluxes[s], at, w.image, work)
+    return Drawn(extra, maps, fp, boxes, clusters, stamps, factors, fluxes)
+
+
+@nb.njit(cache=True, nogil=True)
+def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, first, step, out):
+    """Log-likelihoods of rows first, first + step, ... into `out`; rows where it is -inf already are left alone."""
+    for i in range(first, out.size, step):
+        if out[i] > -math.inf:
+            out[i] = draw(o, counts, w, theta[i], nuisances[i], background[i], flux, free).extra
+            if out[i] > -math.inf:
+                out[i] += _log_likelihood(counts, w, background[i])
+            clear(w)
 
 
 @nb.njit(cache=True)

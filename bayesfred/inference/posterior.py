@@ -398,7 +398,7 @@ class Posterior:
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
         u, v = (np.arange(1 - n, n, 2) / n for n in (nx, ny))
         background = np.polynomial.polynomial.polyval2d(*np.meshgrid(u, v), _square(arguments[2]))
-        bad = 0.0 if drawn.possible else np.nan
+        bad = 0.0 if drawn.extra > -np.inf else np.nan
         return sources + background - self.noise.shift + bad, drawn.fluxes + bad
 
     def start(self) -> Floats:
