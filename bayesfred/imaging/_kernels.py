@@ -14,6 +14,7 @@ tuple, that is as a compile-time constant, so that the loop over pixels vectoris
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -28,6 +29,9 @@ Ints = npt.NDArray[np.int64]
 # Reassociation is left out where a result's last digits matter: it would undo the range reduction of exp2.
 FAST = {"contract", "arcp", "nsz", "nnan", "ninf"}
 REDUCE = FAST | {"reassoc"}
+
+# For functions that only compiled code calls: the wrappers for other callers would add a fifth to the time of compilation.
+inner = partial(nb.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 LANES = 8  # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
 LOG2_E = 1.4426950408889634
@@ -127,7 +131,7 @@ def exp2(x):
     return as_float(as_bits(p) + (as_bits(shifted) << 52))
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _fill(o, s, theta, offset_x, offset_y, a, b):
     """Coefficients of a and b of source s in powers of u and v, about the frame's middle."""
     a[:] = 0.0
@@ -143,7 +147,7 @@ def _fill(o, s, theta, offset_x, offset_y, a, b):
         b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_lever[s, k]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _shift(c, h, k, degree):
     """c(u, v) -> c(u + h, v + k) in place, by repeated synthetic division."""
     top = len(degree)
@@ -157,7 +161,7 @@ def _shift(c, h, k, degree):
                 c[m, n] += k * c[m, n + 1]
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def _evaluate(c, u, v, degree):
     """The polynomial c and its derivatives with respect to u and v."""
     top = len(degree)
@@ -174,7 +178,7 @@ def _evaluate(c, u, v, degree):
     return value, c_u, c_v
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     """Newton's iteration for a = b = 0, leaving a and b expanded about the solution. Returns u, v, found."""
     u = o.x[s] + offset_x
@@ -205,7 +209,7 @@ def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def _multiply(a, b, conserve, q, d):
     """Coefficients of a^2 + b^2, and of a_u b_v - a_v b_u if flux is conserved, else of 1."""
     q[:] = 0.0
@@ -221,7 +225,7 @@ def _multiply(a, b, conserve, q, d):
                         d[n + j - 1, m + i - 1] += (m * j - n * i) * a[m, n] * b[i, j]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _reach(o, a, b, sigma):
     """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = sigma sqrt(cut); inf: the frame.
 
@@ -256,7 +260,7 @@ def _reach(o, a, b, sigma):
     return math.inf
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def locate(o, theta, offset_x, offset_y, sigma, maps):
     """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak)."""
     unfolded = True
@@ -288,7 +292,7 @@ def locate(o, theta, offset_x, offset_y, sigma, maps):
     return unfolded
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def _row(a, b, w, ra, rb, rav, rbv, degree):
     """Coefficients in t = u - u_peak of a, b, a_v and b_v on the row at v = v_peak + w."""
     for m in range(len(degree) + 1):
@@ -302,7 +306,7 @@ def _row(a, b, w, ra, rb, rav, rbv, degree):
         ra[m], rb[m], rav[m], rbv[m] = pa, pb, pav, pbv
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def _along(c, w, factor, out, degree):
     """Coefficients in t of factor times the polynomial with coefficients c[n, m] of w^n t^m."""
     top = len(degree)
@@ -313,7 +317,7 @@ def _along(c, w, factor, out, degree):
         out[m] = factor * p
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def footprints(o, maps):
     """The rows of pixels that every source reaches, their lengths multiples of LANES."""
     size = 0
@@ -348,7 +352,7 @@ def footprints(o, maps):
     return Footprints(first, low[:i], count[:i], start[: i + 1], row[:i])
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def row_starts(fp, pitch):
     """Where every row of pixels begins in a padded, flattened image."""
     at = np.empty(fp.row.size, np.int64)
@@ -357,7 +361,7 @@ def row_starts(fp, pitch):
     return at
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def add_source(o, maps, fp, s, sigma, flux, at, out, work):
     """Add source s to `out`, the samples of row i from at[i] on."""
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this function: a call costs more
@@ -389,7 +393,7 @@ def add_source(o, maps, fp, s, sigma, flux, at, out, work):
                     row[n] += exp2(e) * abs(j)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def new_maps(o):
     """Room for the maps of all sources."""
     size = o.x.size
@@ -399,7 +403,7 @@ def new_maps(o):
     return Maps(a, b, q, d, np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def new_work(o):
     """Room for a row's polynomials."""
     return np.empty((7, 2 * len(o.degree) + 1))
@@ -499,7 +503,7 @@ def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start)
                 row[i] += bx * lower[i] * first[i]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
@@ -556,7 +560,7 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, out, samples, powers, work):
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
     work = new_work(o)

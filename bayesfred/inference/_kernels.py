@@ -44,6 +44,7 @@ from bayesfred.imaging._kernels import (
     as_float,
     basis_row,
     footprints,
+    inner,
     locate,
     new_maps,
     new_work,
@@ -126,7 +127,7 @@ def new_workspace(ny, pitch):
     return Workspace(np.zeros(size), np.zeros(size // SEGMENT, np.uint8), span, np.empty(size), np.empty(size))
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _mark_sources(fp, w):
     """Mark the segments that the sources' rows of pixels lie in."""
     flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
@@ -146,7 +147,7 @@ def _mark_sources(fp, w):
             flags[j * per_row + k] = depth > 0
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _mark_counted(counts, w):
     """Mark every segment with a pixel in the likelihood: a background that varies must be visited everywhere."""
     per_row = w.flags.size // w.span.shape[0]
@@ -158,7 +159,7 @@ def _mark_counted(counts, w):
                 w.span[j, 1] = max(w.span[j, 1], k)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _next_run(flags, span, per_row, j, k):
     """The next marked stretch of row j at or after segment k, as segments [start, stop); start < 0 if there is none."""
     last = span[j, 1]
@@ -187,7 +188,7 @@ def clear(w):
             w.span[j, 1] = -1
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _background_row(background, j, ny):
     """Coefficients of the background polynomial on row j in powers of u; u, v run from -1 to 1 over the frame."""
     v = (2 * j - ny + 1) / ny
@@ -195,7 +196,7 @@ def _background_row(background, j, ny):
     return c0, background[1] + v * background[4], background[3]
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def _slope_run(image, u, step, c1, c2):
     """Add the part of the background that varies along a stretch."""
     for i in range(image.size):
@@ -203,7 +204,7 @@ def _slope_run(image, u, step, c1, c2):
         image[i] += x * (c1 + x * c2)
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
 def _poisson_run(image, values, level):
     """Sum of n log(mu) - mu over the unmasked pixels of a stretch; MASKED or less if one of these has no positive mu."""
     total = 0.0
@@ -215,7 +216,7 @@ def _poisson_run(image, values, level):
     return total
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
 def _square_run(image, values, level):
     """Sum of (n - mu)^2 over the unmasked pixels of a stretch."""
     total = 0.0
@@ -225,7 +226,7 @@ def _square_run(image, values, level):
     return total
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _log_likelihood(counts, w, background):
     """Log-likelihood of the workspace's image plus the background; what depends on the counts alone is left out."""
     ny = w.span.shape[0]
@@ -276,7 +277,7 @@ def _stamps(o, maps, fp, sigma):
     return out
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _boxes(fp):
     """First row, last row + 1, first column, last column + 1 of every footprint."""
     size = fp.first.size - 1
@@ -291,7 +292,7 @@ def _boxes(fp):
     return boxes
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _group(keys, size):
     """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
     first = np.zeros(size + 2, np.int64)
@@ -306,7 +307,7 @@ def _group(keys, size):
     return order, first[:-1]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _clusters(boxes, ny):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
@@ -345,7 +346,7 @@ def _clusters(boxes, ny):
     return Clusters(members, first, start)
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
 def _dot(a, b, weight):
     total = 0.0
     for i in range(a.size):
@@ -374,7 +375,7 @@ def _gram(fp, boxes, members, stamps, weight, pitch, out):
             out[k, i] = total
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _cholesky(h):
     """Lower triangle in place; False where the matrix is not positive definite."""
     for i in range(h.shape[0]):
@@ -391,7 +392,7 @@ def _cholesky(h):
     return True
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _solve(lower, x):
     """x <- (L L^T)^-1 x, in place."""
     n = x.size
@@ -405,7 +406,7 @@ def _solve(lower, x):
         x[i] /= lower[i, i]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _draw(fp, s, stamps, amplitude, pitch, out):
     """Add amplitude times a source's stamp to an image."""
     for i in range(fp.first[s], fp.first[s + 1]):
@@ -416,7 +417,7 @@ def _draw(fp, s, stamps, amplitude, pitch, out):
             target[k] += amplitude * stamp[k]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def _weigh_run(image, values, u, step, c0, c1, c2, score, weight):
     """score = n/mu - 1 and weight = n/mu^2, zero where masked."""
     for i in range(image.size):
@@ -427,7 +428,7 @@ def _weigh_run(image, values, u, step, c0, c1, c2, score, weight):
         weight[i] = n * inverse * inverse
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _weigh_footprint(counts, w, fp, s, background, score, weight):
     """Score and weight of Poisson counts on one source's footprint."""
     ny = w.span.shape[0]
@@ -440,7 +441,7 @@ def _weigh_footprint(counts, w, fp, s, background, score, weight):
         _weigh_run(w.image[a:b], counts.values[a:b], u, 2.0 / counts.nx, c0, c1, c2, score[a:b], weight[a:b])
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _blank(fp, s, pitch, out):
     """Zero an image on one source's footprint."""
     for i in range(fp.first[s], fp.first[s + 1]):
@@ -448,7 +449,7 @@ def _blank(fp, s, pitch, out):
         out[at : at + fp.size[i]] = 0.0
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner(cache=True, error_model="numpy")
 def _largest_change(counts, w, fp, s, background, change):
     """Largest |change| / mu among one source's pixels that hold counts."""
     ny = w.span.shape[0]
@@ -464,7 +465,7 @@ def _largest_change(counts, w, fp, s, background, change):
     return largest
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _first_flux(counts, w, fp, s, stamps, background):
     """Least-squares flux of one source, its neighbours ignored."""
     ny = w.span.shape[0]
@@ -603,7 +604,7 @@ def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, firs
             clear(w)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _weigh(counts, w, background, curve):
     """Score d log L/d mu and weight -d^2 log L/d mu^2 of every marked pixel; curve = -1/2 d weight/d mu."""
     ny = w.span.shape[0]
@@ -708,7 +709,7 @@ def gradient(o, counts, w, drawn, sigma, background, free, basis, out, out_backg
             out[k] += basis.lever[s, k] * moments[basis.row[k]]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _background_gradient(counts, w, background, image, out):
     """Sum of the image times 1, u, v, u^2, uv, v^2 over the likelihood's pixels."""
     ny = w.span.shape[0]
@@ -735,7 +736,7 @@ def _background_gradient(counts, w, background, image, out):
         out[0] += rest / background[0] - pixels if counts.kind == POISSON else (rest - background[0] * pixels) / background[0]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _fisher_weight(counts, w, background):
     """Expected information 1 / variance per marked pixel into w.weight, zero where masked; returns the unmarked pixels."""
     ny = w.span.shape[0]
