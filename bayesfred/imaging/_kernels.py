@@ -30,11 +30,13 @@ Ints = npt.NDArray[np.int64]
 FAST = {"contract", "arcp", "nsz", "nnan", "ninf"}
 REDUCE = FAST | {"reassoc"}
 
-# For functions that only compiled code calls: the wrappers for other callers would add a fifth to the time of compilation.
+# For functions that only compiled code calls (Python must not: it would crash): wrappers for other callers would add a seventh
+# to the time of compilation.
 inner = partial(nb.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 LANES = 8  # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
 LOG2_E = 1.4426950408889634
+BATCH = 32  # sources whose rows are listed at a time: of many sources the list would outgrow the caches
 SEGMENT = 16  # pixels that are marked together as reached by a source
 
 
@@ -320,15 +322,15 @@ def _along(c, w, factor, out, degree):
 @inner(cache=True, fastmath=FAST, error_model="numpy")
 def footprints(o, maps):
     """The rows of pixels that every source reaches, their lengths multiples of LANES."""
-    size = 0
-    for s in range(o.x.size):
+    sources, size = maps.peak.shape[0], 0
+    for s in range(sources):
         size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
-    first = np.zeros(o.x.size + 1, np.int64)
+    first = np.zeros(sources + 1, np.int64)
     low, count, row = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     start = np.zeros(size + 1, np.int64)
     ny, nx, step = o.ny, o.nx, o.step
     i = 0
-    for s in range(o.x.size):
+    for s in range(sources):
         alpha, beta, gamma, square = maps.ellipse[s, 0], maps.ellipse[s, 1], maps.ellipse[s, 2], maps.ellipse[s, 3]
         # In columns, row v_peak + w has its chord's middle at middle + slope w, and half the chord squared is half - bend w^2.
         middle, slope, half, bend = 0.0, 0.0, 1.0 * nx * nx, 0.0
@@ -415,10 +417,14 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
     maps = new_maps(o)
     work = new_work(o)
     unfolded = locate(o, theta, offset_x, offset_y, sigma, maps)
-    fp = footprints(o, maps)
-    at = row_starts(fp, out.size // o.ny)
-    for s in range(o.x.size):
-        add_source(o, maps, fp, s, sigma, flux[s], at, out, work)
+    for s in range(0, flux.size, BATCH):
+        e = s + BATCH
+        a, b, q, d = maps.a[s:e], maps.b[s:e], maps.q[s:e], maps.d[s:e]
+        part = Maps(a, b, q, d, maps.peak[s:e], maps.ellipse[s:e], maps.rows[s:e])
+        fp = footprints(o, part)
+        at = row_starts(fp, out.size // o.ny)
+        for i in range(part.peak.shape[0]):
+            add_source(o, part, fp, i, sigma, flux[s + i], at, out, work)
     return unfolded
 
 
