@@ -216,6 +216,14 @@ def _poisson_run(image, values, level):
     return total
 
 
+@inner(cache=True, fastmath=REDUCE)
+def _sum(values):
+    total = 0.0
+    for i in range(values.size):
+        total += values[i]
+    return total
+
+
 @inner(cache=True, fastmath=REDUCE, error_model="numpy")
 def _square_run(image, values, level):
     """Sum of (n - mu)^2 over the unmasked pixels of a stretch."""
@@ -245,9 +253,8 @@ def _log_likelihood(counts, w, background):
                 total += _poisson_run(w.image[a:b], counts.values[a:b], c0)
             else:
                 total += _square_run(w.image[a:b], counts.values[a:b], c0)
-            for k in range(j * per_row + start, j * per_row + stop):
-                pixels -= counts.segment_pixels[k]
-                rest -= counts.segment_sum[k]
+            pixels -= _sum(counts.segment_pixels[j * per_row + start : j * per_row + stop])
+            rest -= _sum(counts.segment_sum[j * per_row + start : j * per_row + stop])
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)
     level = background[0]
     if counts.kind == GAUSSIAN:  # afresh: what is left of the totals would have lost its digits to bright sources

@@ -419,11 +419,14 @@ class Posterior:
 
     def _arguments(self, vectors: Floats) -> tuple[Floats, Floats, Floats]:
         """Distortion coefficients, source nuisances and background coefficients, one row a parameter vector."""
-        column = {name: vectors[:, k] for k, name in enumerate(self.parameter_names)}
-        n = len(vectors)
-        fixed = {"flux_scale": 1.0, "psf_sigma": self.model.psf.sigma}
-        nuisances = np.stack([column.get(name, np.full(n, fixed.get(name, 0.0))) for name in SOURCE_NUISANCES], axis=1)
-        background = np.stack([column.get(name, np.zeros(n)) for name in BACKGROUND_TERMS], axis=1)
+        nuisances = np.zeros((len(vectors), len(SOURCE_NUISANCES)))
+        background = np.zeros((len(vectors), len(BACKGROUND_TERMS)))
+        nuisances[:, SOURCE_NUISANCES.index("flux_scale")] = 1.0
+        nuisances[:, SOURCE_NUISANCES.index("psf_sigma")] = self.model.psf.sigma
+        for values, names in ((nuisances, SOURCE_NUISANCES), (background, BACKGROUND_TERMS)):
+            for k, name in enumerate(names):
+                if name in self.parameter_names:
+                    values[:, k] = vectors[:, self.parameter_names.index(name)]
         background[:, 0] += self.noise.shift
         return np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]), nuisances, background
 
