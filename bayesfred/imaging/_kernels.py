@@ -228,7 +228,7 @@ def _multiply(a, b, conserve, q, d):
 
 
 @inner(cache=True)
-def _reach(o, a, b, sigma):
+def _reach(o, a, b, sigma, bounds):
     """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = sigma sqrt(cut); inf: the frame.
 
     With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2 of
@@ -246,14 +246,17 @@ def _reach(o, a, b, sigma):
     radius = sigma * math.sqrt(o.cut)
     if not (smallest > 0.0 and radius < math.inf):
         return math.inf
+    bounds[:] = 0.0  # rho's coefficients
+    for m in range(a.shape[0]):
+        for n in range(a.shape[1]):
+            bounds[m + n] += math.sqrt(a[m, n] * a[m, n] + b[m, n] * b[m, n])
     reach = radius
     for _ in range(60):
         d = reach / smallest
         rest = 0.0
-        for m in range(a.shape[0]):
-            for n in range(a.shape[1]):
-                if m + n >= 2:
-                    rest += math.hypot(a[m, n], b[m, n]) * d ** (m + n)
+        for k in range(bounds.size - 1, 1, -1):
+            rest = (rest + bounds[k]) * d
+        rest *= d
         if radius + rest <= reach * (1.0 + 1e-6):
             return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * abs(o.offsets[0])
         reach = radius + rest
@@ -266,6 +269,7 @@ def _reach(o, a, b, sigma):
 def locate(o, theta, offset_x, offset_y, sigma, maps):
     """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak)."""
     unfolded = True
+    bounds = np.empty(2 * len(o.degree) + 1)
     for s in range(o.x.size):
         a = maps.a[s]
         b = maps.b[s]
@@ -274,7 +278,7 @@ def locate(o, theta, offset_x, offset_y, sigma, maps):
         _multiply(a, b, len(o.d_degree) > 0, maps.q[s], maps.d[s])
         maps.peak[s, 0] = u
         maps.peak[s, 1] = v
-        reach = _reach(o, a, b, sigma) if ok else math.inf
+        reach = _reach(o, a, b, sigma, bounds) if ok else math.inf
         if reach < math.inf:
             alpha = a[1, 0] ** 2 + b[1, 0] ** 2
             maps.ellipse[s, 0] = alpha
