@@ -84,8 +84,8 @@ class Footprints(NamedTuple):
 
 
 def stride(nx: int) -> int:
-    """Pixels a padded image row takes."""
-    return -(-(nx + LANES) // SEGMENT) * SEGMENT
+    """Pixels a padded image row takes: an odd number of segments, lest the rows' pixels fall on the same cache lines."""
+    return (-(-(nx + LANES) // SEGMENT) | 1) * SEGMENT
 
 
 @intrinsic

@@ -133,7 +133,7 @@ def _mark_sources(fp, w):
     flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
     per_row = flags.size // span.shape[0]
     pitch = per_row + 1
-    change = np.zeros(span.shape[0] * pitch, np.int64)  # in the number of rows on a segment: two writes for a row of any length
+    change = np.zeros(span.shape[0] * pitch, np.int32)  # in the number of rows on a segment: two writes for a row of any length
     for i in range(rows.size):
         j, a, b = rows[i], lows[i] // SEGMENT, (lows[i] + sizes[i] - 1) // SEGMENT
         span[j, 0] = min(span[j, 0], a)
