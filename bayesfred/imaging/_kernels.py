@@ -5,15 +5,16 @@ For one source the displacement is a polynomial in (u, v) alone, so the kernel's
     a = u - x + f(u, v, x, y) - offset_x,        b = v - y + g(u, v, x, y) - offset_y
 
 are two small coefficient matrices. They are expanded about the source's peak, where a = b = 0, which makes
-them well conditioned and gives the window of pixels to visit. Along a row of pixels they are polynomials in u
-alone, and so are a^2 + b^2 and the Jacobian determinant D = a_u b_v - a_v b_u: a sample of the kernel costs two Horner
-sweeps and one exponential. The degree in u reaches the innermost loop as the length of a tuple, that is as a
-compile-time constant, so that the loop over pixels vectorises for every degree.
+them well conditioned and gives the window of pixels to visit. So are a^2 + b^2 and the Jacobian determinant
+D = a_u b_v - a_v b_u, multiplied out once per source. Along a row of pixels they are polynomials in u alone: a sample of
+the kernel costs two Horner sweeps and one exponential. The degree in u reaches the innermost loop as the length of a
+tuple, that is as a compile-time constant, so that the loop over pixels vectorises for every degree.
 
 `forward.py` binds these functions to the public objects; the loops over counts are in `inference/_kernels.py`.
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -29,8 +30,13 @@ Ints = npt.NDArray[np.int64]
 FAST = {"contract", "arcp", "nsz", "nnan", "ninf"}
 REDUCE = FAST | {"reassoc"}
 
+# For functions that only compiled code calls (Python must not: it would crash): wrappers for other callers would add a seventh
+# to the time of compilation.
+inner = partial(nb.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
 LANES = 8  # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
 LOG2_E = 1.4426950408889634
+BATCH = 32  # sources whose rows are listed at a time: of many sources the list would outgrow the caches
 SEGMENT = 16  # pixels that are marked together as reached by a source
 
 
@@ -49,18 +55,19 @@ class Optics(NamedTuple):
     ny: int
     nx: int
     cut: float  # -2 log(tolerance)
-    v_degree: int
     ramp: Floats  # (padded row,) u of pixels counted from a row's first
-    u_degree: tuple[int, ...]  # its length is the degree in u of a and b
+    degree: tuple[int, ...]  # its length is the degree of a and b in u or v, whichever is higher
     q_degree: tuple[int, ...]  # of a^2 + b^2
-    d_degree: tuple[int, ...]  # its length is the degree in u of D; empty where flux is not conserved
+    d_degree: tuple[int, ...]  # of D; empty where flux is not conserved
 
 
 class Maps(NamedTuple):
     """Where the sources are imaged and which pixels they reach."""
 
-    a: Floats  # (s, u_degree + 1, v_degree + 1) coefficients about the peak
+    a: Floats  # (s, degree + 1, degree + 1) coefficients about the peak, powers of u first
     b: Floats
+    q: Floats  # (s, q_degree + 1, q_degree + 1) of a^2 + b^2, powers of v first
+    d: Floats  # (s, d_degree + 1, d_degree + 1) of D, or 1 where flux is not conserved
     peak: Floats  # (s, 2) u, v
     ellipse: Floats  # (s, 4) alpha, beta, gamma, R^2: alpha t^2 + 2 beta t w + gamma w^2 <= R^2
     rows: Ints  # (s, 2) first row and the one after the last
@@ -77,8 +84,8 @@ class Footprints(NamedTuple):
 
 
 def stride(nx: int) -> int:
-    """Pixels a padded image row takes."""
-    return -(-(nx + LANES) // SEGMENT) * SEGMENT
+    """Pixels a padded image row takes: an odd number of segments, lest the rows' pixels fall on the same cache lines."""
+    return (-(-(nx + LANES) // SEGMENT) | 1) * SEGMENT
 
 
 @intrinsic
@@ -126,7 +133,7 @@ def exp2(x):
     return as_float(as_bits(p) + (as_bits(shifted) << 52))
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _fill(o, s, theta, offset_x, offset_y, a, b):
     """Coefficients of a and b of source s in powers of u and v, about the frame's middle."""
     a[:] = 0.0
@@ -142,21 +149,38 @@ def _fill(o, s, theta, offset_x, offset_y, a, b):
         b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_lever[s, k]
 
 
-@nb.njit(cache=True)
-def _shift(c, h, k):
+@inner(cache=True)
+def _shift(c, h, k, degree):
     """c(u, v) -> c(u + h, v + k) in place, by repeated synthetic division."""
-    m1, n1 = c.shape
-    for n in range(n1):
-        for i in range(m1 - 1):
-            for m in range(m1 - 2, i - 1, -1):
+    top = len(degree)
+    for n in range(top + 1):
+        for i in range(top):
+            for m in range(top - 1, i - 1, -1):
                 c[m, n] += h * c[m + 1, n]
-    for m in range(m1):
-        for i in range(n1 - 1):
-            for n in range(n1 - 2, i - 1, -1):
+    for m in range(top + 1):
+        for i in range(top):
+            for n in range(top - 1, i - 1, -1):
                 c[m, n] += k * c[m, n + 1]
 
 
-@nb.njit(cache=True)
+@inner(cache=True, fastmath=FAST)
+def _evaluate(c, u, v, degree):
+    """The polynomial c and its derivatives with respect to u and v."""
+    top = len(degree)
+    value, c_u, c_v = 0.0, 0.0, 0.0
+    for i in range(top + 1):
+        m = top - i
+        row, row_v = c[m, top], 0.0
+        for k in range(top):  # Horner's scheme carries the derivative along
+            row_v = row_v * v + row
+            row = row * v + c[m, top - 1 - k]
+        c_u = c_u * u + value
+        value = value * u + row
+        c_v = c_v * u + row_v
+    return value, c_u, c_v
+
+
+@inner(cache=True)
 def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     """Newton's iteration for a = b = 0, leaving a and b expanded about the solution. Returns u, v, found."""
     u = o.x[s] + offset_x
@@ -164,34 +188,47 @@ def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     far = 4.0 * o.step * (o.nx + o.ny)
     found = False
     _fill(o, s, theta, offset_x, offset_y, a, b)
-    _shift(a, u, v)
-    _shift(b, u, v)
     for _ in range(50):
-        det = a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0]
+        a_0, a_u, a_v = _evaluate(a, u, v, o.degree)
+        b_0, b_u, b_v = _evaluate(b, u, v, o.degree)
+        det = a_u * b_v - a_v * b_u
         if det == 0.0:
             break
-        h = (a[0, 1] * b[0, 0] - b[0, 1] * a[0, 0]) / det
-        k = (b[1, 0] * a[0, 0] - a[1, 0] * b[0, 0]) / det
+        h = (a_v * b_0 - b_v * a_0) / det
+        k = (b_u * a_0 - a_u * b_0) / det
         if not (abs(h) + abs(k) < far):
             break
         u += h
         v += k
-        _shift(a, h, k)
-        _shift(b, h, k)
         if abs(h) + abs(k) <= 1e-9:  # quadratic convergence: the next step would be far below rounding
             found = True
             break
     if not found:
         u = o.x[s]
         v = o.y[s]
-    _fill(o, s, theta, offset_x, offset_y, a, b)  # one shift from the start, free of the steps' rounding
-    _shift(a, u, v)
-    _shift(b, u, v)
+    _shift(a, u, v, o.degree)
+    _shift(b, u, v, o.degree)
     return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
 
 
-@nb.njit(cache=True)
-def _reach(o, a, b, radius):
+@inner(cache=True, fastmath=FAST)
+def _multiply(a, b, conserve, q, d):
+    """Coefficients of a^2 + b^2, and of a_u b_v - a_v b_u if flux is conserved, else of 1."""
+    q[:] = 0.0
+    d[:] = 0.0
+    if not conserve:
+        d[0, 0] = 1.0
+    for m in range(a.shape[0]):
+        for n in range(a.shape[1]):
+            for i in range(a.shape[0]):
+                for j in range(a.shape[1]):
+                    q[n + j, m + i] += a[m, n] * a[i, j] + b[m, n] * b[i, j]
+                    if conserve and m * j != n * i:
+                        d[n + j - 1, m + i - 1] += (m * j - n * i) * a[m, n] * b[i, j]
+
+
+@inner(cache=True)
+def _reach(o, a, b, radius, bounds):
     """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius; inf: the frame.
 
     With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2 of
@@ -208,23 +245,26 @@ def _reach(o, a, b, radius):
     smallest = abs(det) / largest if largest > 0.0 else 0.0
     if not (smallest > 0.0 and radius < math.inf):
         return math.inf
+    bounds[:] = 0.0  # rho's coefficients
+    for m in range(a.shape[0]):
+        for n in range(a.shape[1]):
+            bounds[m + n] += math.sqrt(a[m, n] * a[m, n] + b[m, n] * b[m, n])
     reach = radius
     for _ in range(60):
         d = reach / smallest
         rest = 0.0
-        for m in range(a.shape[0]):
-            for n in range(a.shape[1]):
-                if m + n >= 2:
-                    rest += math.hypot(a[m, n], b[m, n]) * d ** (m + n)
+        for k in range(bounds.size - 1, 1, -1):
+            rest = (rest + bounds[k]) * d
+        rest *= d
         if radius + rest <= reach * (1.0 + 1e-6):
-            return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * np.max(np.abs(o.offsets))
+            return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * abs(o.offsets[0])
         reach = radius + rest
         if reach > 4.0 * radius:
             break
     return math.inf
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
     """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak).
 
@@ -232,14 +272,16 @@ def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
     """
     unfolded = True
     radius = sigma * math.sqrt(o.cut) + margin
+    bounds = np.empty(2 * len(o.degree) + 1)
     for s in range(o.x.size):
         a = maps.a[s]
         b = maps.b[s]
         u, v, ok = _find_peak(o, s, theta, offset_x, offset_y, a, b)
         unfolded = unfolded and ok
+        _multiply(a, b, len(o.d_degree) > 0, maps.q[s], maps.d[s])
         maps.peak[s, 0] = u
         maps.peak[s, 1] = v
-        reach = _reach(o, a, b, radius) if ok else math.inf
+        reach = _reach(o, a, b, radius, bounds) if ok else math.inf
         if reach < math.inf:
             alpha = a[1, 0] ** 2 + b[1, 0] ** 2
             maps.ellipse[s, 0] = alpha
@@ -259,34 +301,10 @@ def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
     return unfolded
 
 
-@nb.njit(cache=True, inline="always")
-def chord(peak, ellipse, j, ny, nx, step):
-    """First pixel and number of pixels of row j that a source reaches; the number is a multiple of LANES."""
-    low = 0
-    high = nx
-    alpha = ellipse[0]
-    if alpha > 0.0:
-        w = (j - 0.5 * (ny - 1)) * step - peak[1]
-        beta = ellipse[1]
-        disc = beta * beta * w * w - alpha * (ellipse[2] * w * w - ellipse[3])
-        if disc < 0.0:
-            return 0, 0
-        middle = peak[0] - beta * w / alpha
-        half = math.sqrt(disc) / alpha
-        centre = 0.5 * (nx - 1)
-        left = min(max((middle - half) / step + centre, 0.0), 1.0 * nx)
-        right = min(max((middle + half) / step + centre, -1.0), nx - 1.0)
-        low = math.ceil(left)
-        high = math.floor(right) + 1
-    if high <= low:
-        return 0, 0
-    return low, -(-(high - low) // LANES) * LANES
-
-
-@nb.njit(cache=True, fastmath=FAST)
-def _row(a, b, w, ra, rb, rav, rbv, u_degree):
+@inner(cache=True, fastmath=FAST)
+def _row(a, b, w, ra, rb, rav, rbv, degree):
     """Coefficients in t = u - u_peak of a, b, a_v and b_v on the row at v = v_peak + w."""
-    for m in range(len(u_degree) + 1):
+    for m in range(len(degree) + 1):
         pa, pb, pav, pbv = 0.0, 0.0, 0.0, 0.0
         for k in range(a.shape[1]):
             n = a.shape[1] - 1 - k
@@ -297,118 +315,45 @@ def _row(a, b, w, ra, rb, rav, rbv, u_degree):
         ra[m], rb[m], rav[m], rbv[m] = pa, pb, pav, pbv
 
 
-@nb.njit(cache=True, fastmath=FAST)
-def _row_products(ra, rb, rav, rbv, k, amplitude, rq, rd, u_degree, q_degree, d_degree):
-    """Coefficients in t of the exponent k (a^2 + b^2) and of amplitude times D (of amplitude alone, without D)."""
-    size = len(u_degree) + 1
-    for p in range(len(q_degree) + 1):
-        q = 0.0
-        for m in range(size):
-            if 0 <= p - m < size:
-                q += ra[m] * ra[p - m] + rb[m] * rb[p - m]
-        rq[p] = k * q
-    rd[0] = amplitude
-    if len(d_degree) > 0:
-        for p in range(len(d_degree) + 1):
-            d = 0.0
-            for m in range(1, size):
-                if 0 <= p + 1 - m < size:
-                    d += m * (ra[m] * rbv[p + 1 - m] - rb[m] * rav[p + 1 - m])
-            rd[p] = amplitude * d
+@inner(cache=True, fastmath=FAST)
+def _along(c, w, factor, out, degree):
+    """Coefficients in t of factor times the polynomial with coefficients c[n, m] of w^n t^m."""
+    top = len(degree)
+    for m in range(top + 1):
+        p = c[top, m]
+        for n in range(top):
+            p = p * w + c[top - 1 - n, m]
+        out[m] = factor * p
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _add_row(row, ramp, t0, rq, rd, q_degree, d_degree):
-    """row[i] += 2^q(t) |d(t)| at t = t0 + ramp[i], q and d given by their coefficients."""
-    q_top = len(q_degree)
-    d_top = len(d_degree)
-    for i in range(row.size):
-        t = t0 + ramp[i]
-        q = rq[q_top]
-        for m in range(q_top):
-            q = q * t + rq[q_top - 1 - m]
-        d = rd[d_top]
-        for m in range(d_top):
-            d = d * t + rd[d_top - 1 - m]
-        row[i] += exp2(q) * abs(d)
-
-
-@nb.njit(cache=True, inline="always")
-def add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, amplitude, work, u_degree, q_degree, d_degree):
-    """Add a source's counts to a row of pixels whose first centre is (t, w) from the peak."""
-    ra, rb, rav, rbv, rq, rd = work[0], work[1], work[2], work[3], work[4], work[5]
-    k = -0.5 * LOG2_E / (sigma * sigma)
-    norm = amplitude / (2.0 * math.pi * sigma * sigma)
-    for q in range(offsets.size):
-        _row(a, b, w + offsets[q], ra, rb, rav, rbv, u_degree)
-        for p in range(offsets.size):
-            weight = norm * weights[q] * weights[p]
-            _row_products(ra, rb, rav, rbv, k, weight, rq, rd, u_degree, q_degree, d_degree)
-            _add_row(row, ramp, t + offsets[p], rq, rd, q_degree, d_degree)
-
-
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _add_template_row(image, along, across, ramp, t0, rq, rd, ra, rb, q_degree, d_degree, u_degree):
-    """Like `_add_row`, and `along` and `across` get the same times a and b."""
-    q_top, d_top, top = len(q_degree), len(d_degree), len(u_degree)
-    for i in range(image.size):
-        t = t0 + ramp[i]
-        q = rq[q_top]
-        for m in range(q_top):
-            q = q * t + rq[q_top - 1 - m]
-        d = rd[d_top]
-        for m in range(d_top):
-            d = d * t + rd[d_top - 1 - m]
-        a, b = ra[top], rb[top]
-        for m in range(top):
-            a = a * t + ra[top - 1 - m]
-            b = b * t + rb[top - 1 - m]
-        k = exp2(q) * abs(d)
-        image[i] += k
-        along[i] += k * a
-        across[i] += k * b
-
-
-@nb.njit(cache=True)
-def add_templates(o, maps, fp, s, sigma, flux, stamps, work):
-    """Add K, F X and F Y of source s to stamps[0], stamps[1] and stamps[2]: X = a K/sigma^2 moves it along a, Y along b."""
-    a, b, u, v = maps.a[s], maps.b[s], maps.peak[s, 0], maps.peak[s, 1]
-    ra, rb, rav, rbv, rq, rd = work[0], work[1], work[2], work[3], work[4], work[5]
-    offsets, weights, ramp = o.offsets, o.weights, o.ramp
-    u_degree, q_degree, d_degree = o.u_degree, o.q_degree, o.d_degree
-    inverse = 1.0 / (sigma * sigma)
-    for p in range(fp.first[s], fp.first[s + 1]):
-        first, last = fp.start[p], fp.start[p + 1]
-        row, along, across = stamps[0, first:last], stamps[1, first:last], stamps[2, first:last]
-        w = (fp.row[p] - 0.5 * (o.ny - 1)) * o.step - v
-        t = (fp.low[p] - 0.5 * (o.nx - 1)) * o.step - u
-        for q in range(offsets.size):
-            _row(a, b, w + offsets[q], ra, rb, rav, rbv, u_degree)
-            for k in range(offsets.size):
-                weight = weights[q] * weights[k] * inverse / (2.0 * math.pi)
-                _row_products(ra, rb, rav, rbv, -0.5 * LOG2_E * inverse, weight, rq, rd, u_degree, q_degree, d_degree)
-                _add_template_row(row, along, across, ramp, t + offsets[k], rq, rd, ra, rb, q_degree, d_degree, u_degree)
-        for i in range(row.size):
-            along[i] *= flux * inverse
-            across[i] *= flux * inverse
-
-
-@nb.njit(cache=True)
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def footprints(o, maps):
-    """The rows of pixels that every source reaches."""
-    size = 0
-    for s in range(o.x.size):
+    """The rows of pixels that every source reaches, their lengths multiples of LANES."""
+    sources, size = maps.peak.shape[0], 0
+    for s in range(sources):
         size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
-    first = np.zeros(o.x.size + 1, np.int64)
+    first = np.zeros(sources + 1, np.int64)
     low, count, row = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     start = np.zeros(size + 1, np.int64)
     ny, nx, step = o.ny, o.nx, o.step
     i = 0
-    for s in range(o.x.size):
-        peak, ellipse = maps.peak[s], maps.ellipse[s]
+    for s in range(sources):
+        alpha, beta, gamma, square = maps.ellipse[s, 0], maps.ellipse[s, 1], maps.ellipse[s, 2], maps.ellipse[s, 3]
+        # In columns, row v_peak + w has its chord's middle at middle + slope w, and half the chord squared is half - bend w^2.
+        middle, slope, half, bend = 0.0, 0.0, 1.0 * nx * nx, 0.0
+        if alpha > 0.0:
+            middle = maps.peak[s, 0] / step + 0.5 * (nx - 1)
+            slope = -beta / (alpha * step)
+            half = square / (alpha * step * step)
+            bend = (alpha * gamma - beta * beta) / (alpha * step) ** 2
+        top = maps.peak[s, 1] + 0.5 * (ny - 1) * step
         for j in range(maps.rows[s, 0], maps.rows[s, 1]):
-            at, n = chord(peak, ellipse, j, ny, nx, step)
+            w = j * step - top
+            reach = math.sqrt(max(half - bend * w * w, 0.0))
+            at = math.ceil(min(max(middle + slope * w - reach, 0.0), 1.0 * nx))
+            n = math.floor(min(max(middle + slope * w + reach, -1.0), nx - 1.0)) + 1 - at
             if n > 0:
+                n = -(-n // LANES) * LANES
                 low[i], count[i], row[i] = at, n, j
                 start[i + 1] = start[i] + n
                 i += 1
@@ -416,34 +361,107 @@ def footprints(o, maps):
     return Footprints(first, low[:i], count[:i], start[: i + 1], row[:i])
 
 
-@nb.njit(cache=True)
-def add_source(o, maps, fp, s, sigma, flux, out, work):
-    """Add source s to the padded, flattened image `out`."""
-    # What the rows share is taken out of the tuples once: handing them on costs more than a short row.
-    a, b, u, v = maps.a[s], maps.b[s], maps.peak[s, 0], maps.peak[s, 1]
-    offsets, weights, step, ny, nx, ramp = o.offsets, o.weights, o.step, o.ny, o.nx, o.ramp
-    pitch = out.size // ny
+@inner(cache=True)
+def row_starts(fp, pitch):
+    """Where every row of pixels begins in a padded, flattened image."""
+    at = np.empty(fp.row.size, np.int64)
+    for i in range(at.size):
+        at[i] = fp.row[i] * pitch + fp.low[i]
+    return at
+
+
+@inner(cache=True, fastmath=FAST, error_model="numpy")
+def add_source(o, maps, fp, s, sigma, flux, at, out, work):
+    """Add source s to `out`, the samples of row i from at[i] on."""
+    # What the rows share is taken out of the tuples once, and the loop over pixels stays in this function: a call costs more
+    # than a short row.
+    q, d, u, v = maps.q[s], maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
+    offsets, weights, step, lows, rows, sizes = o.offsets, o.weights, o.step, fp.low, fp.row, fp.size
+    middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
+    rq, rd, ramp = work[0], work[1], o.ramp
+    q_top, d_top = len(o.q_degree), len(o.d_degree)
+    k = -0.5 * LOG2_E / (sigma * sigma)
+    norm = flux / (2.0 * math.pi * sigma * sigma)
     for i in range(fp.first[s], fp.first[s + 1]):
-        low, j = fp.low[i], fp.row[i]
-        start = j * pitch + low
-        w = (j - 0.5 * (ny - 1)) * step - v
-        t = (low - 0.5 * (nx - 1)) * step - u
-        row = out[start : start + fp.size[i]]
-        add_pixels(row, w, t, a, b, offsets, weights, ramp, sigma, flux, work, o.u_degree, o.q_degree, o.d_degree)
+        w = (rows[i] - middle_v) * step - v
+        t_low = (lows[i] - middle_u) * step - u
+        row = out[at[i] : at[i] + sizes[i]]
+        for y in range(offsets.size):
+            _along(q, w + offsets[y], k, rq, o.q_degree)
+            for x in range(offsets.size):
+                _along(d, w + offsets[y], norm * weights[y] * weights[x], rd, o.d_degree)
+                t0 = t_low + offsets[x]
+                for n in range(row.size):
+                    t = t0 + ramp[n]
+                    e = rq[q_top]
+                    for m in range(q_top):
+                        e = e * t + rq[q_top - 1 - m]
+                    j = rd[d_top]
+                    for m in range(d_top):
+                        j = j * t + rd[d_top - 1 - m]
+                    row[n] += exp2(e) * abs(j)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
+def move(o, maps, s, by_x, by_y):
+    """Shift source s along a and b."""
+    maps.a[s, 0, 0] -= by_x
+    maps.b[s, 0, 0] -= by_y
+    _multiply(maps.a[s], maps.b[s], len(o.d_degree) > 0, maps.q[s], maps.d[s])
+
+
+@inner(cache=True, fastmath=FAST, error_model="numpy")
+def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
+    """Like `add_source` at unit flux, and F X and F Y beside it: X = a K / sigma^2 is K's derivative as s moves along a."""
+    u, v = maps.peak[s, 0], maps.peak[s, 1]
+    offsets, weights, step, ramp = o.offsets, o.weights, o.step, o.ramp
+    rq, rd, ra, rb, rav, rbv = work[0], work[1], work[2], work[3], work[4], work[5]
+    q_top, d_top, top = len(o.q_degree), len(o.d_degree), len(o.degree)
+    inverse = 1.0 / (sigma * sigma)
+    for i in range(fp.first[s], fp.first[s + 1]):
+        w = (fp.row[i] - 0.5 * (o.ny - 1)) * step - v
+        t_low = (fp.low[i] - 0.5 * (o.nx - 1)) * step - u
+        first, last = fp.start[i], fp.start[i + 1]
+        row, row_a, row_b = image[first:last], along[first:last], across[first:last]
+        for y in range(offsets.size):
+            _along(maps.q[s], w + offsets[y], -0.5 * LOG2_E * inverse, rq, o.q_degree)
+            _row(maps.a[s], maps.b[s], w + offsets[y], ra, rb, rav, rbv, o.degree)
+            for x in range(offsets.size):
+                weight = weights[y] * weights[x] * inverse / (2.0 * math.pi)
+                _along(maps.d[s], w + offsets[y], weight, rd, o.d_degree)
+                t0 = t_low + offsets[x]
+                for n in range(row.size):
+                    t = t0 + ramp[n]
+                    e = rq[q_top]
+                    for m in range(q_top):
+                        e = e * t + rq[q_top - 1 - m]
+                    j = rd[d_top]
+                    for m in range(d_top):
+                        j = j * t + rd[d_top - 1 - m]
+                    a, b = ra[top], rb[top]
+                    for m in range(top):
+                        a = a * t + ra[top - 1 - m]
+                        b = b * t + rb[top - 1 - m]
+                    k = exp2(e) * abs(j)
+                    row[n] += k
+                    row_a[n] += flux * inverse * k * a
+                    row_b[n] += flux * inverse * k * b
+
+
+@inner(cache=True)
 def new_maps(o):
     """Room for the maps of all sources."""
     size = o.x.size
-    shape = (size, len(o.u_degree) + 1, o.v_degree + 1)
-    return Maps(np.empty(shape), np.empty(shape), np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
+    n, n_q, n_d = len(o.degree) + 1, len(o.q_degree) + 1, len(o.d_degree) + 1
+    a, b = np.empty((size, n, n)), np.empty((size, n, n))
+    q, d = np.empty((size, n_q, n_q)), np.empty((size, n_d, n_d))
+    return Maps(a, b, q, d, np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def new_work(o):
     """Room for a row's polynomials."""
-    return np.empty((7, 2 * len(o.u_degree) + 2))
+    return np.empty((7, 2 * len(o.degree) + 1))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -452,9 +470,14 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
     maps = new_maps(o)
     work = new_work(o)
     unfolded = locate(o, theta, offset_x, offset_y, sigma, 0.0, maps)
-    fp = footprints(o, maps)
-    for s in range(o.x.size):
-        add_source(o, maps, fp, s, sigma, flux[s], out, work)
+    for s in range(0, flux.size, BATCH):
+        e = s + BATCH
+        a, b, q, d = maps.a[s:e], maps.b[s:e], maps.q[s:e], maps.d[s:e]
+        part = Maps(a, b, q, d, maps.peak[s:e], maps.ellipse[s:e], maps.rows[s:e])
+        fp = footprints(o, part)
+        at = row_starts(fp, out.size // o.ny)
+        for i in range(part.peak.shape[0]):
+            add_source(o, part, fp, i, sigma, flux[s + i], at, out, work)
     return unfolded
 
 
@@ -552,7 +575,7 @@ def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start)
                 row[i] += bx * lower[i] * first[i]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, powers, work):
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
@@ -577,33 +600,34 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
     e, size, signed, along_a, along_b = samples[0, :n], samples[1, :n], samples[2, :n], samples[3, :n], samples[4, :n]
     f_u, f_v, g_u, g_v = samples[5, :n], samples[6, :n], samples[7, :n], samples[8, :n]
     row_k, row_s = out[n_f + n_g], out[n_f + n_g + 1]
-    top = len(o.u_degree)
+    top = len(o.degree)
     slope[:] = 0.0
     for q in range(o.offsets.size):
         v = v_row + o.offsets[q]
-        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.u_degree)
-        _row_products(ra, rb, rav, rbv, k, 1.0, rq, rd, o.u_degree, o.q_degree, o.d_degree)
+        _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.degree)
+        _along(maps.q[s], v - maps.peak[s, 1], k, rq, o.q_degree)
+        _along(maps.d[s], v - maps.peak[s, 1], 1.0, rd, o.d_degree)
         for p in range(o.offsets.size):
             u = u_row + o.offsets[p]
             t = u - maps.peak[s, 0]
             _exponential_row(e, ramp, t, rq, norm * o.weights[q] * o.weights[p], o.q_degree)
             _times_polynomial(signed, e, 1.0, ramp, t, rd, o.d_degree)
             _absolute_and_sign(size, signed, e)
-            _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.u_degree)
-            _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.u_degree)
+            _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.degree)
+            _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.degree)
             if template == 1:
                 _to_shift(along_a, along_b, size, signed, inverse)
             elif template == 2:
                 _to_shift(along_b, along_a, size, signed, inverse)
             if conserve:
-                _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.u_degree)
-                _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.u_degree)
+                _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
+                _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.degree)
                 for m in range(top):
                     slope[m] = -(m + 1) * rb[m + 1]
-                _times_polynomial(f_v, signed, 1.0, ramp, t, slope, o.u_degree)
+                _times_polynomial(f_v, signed, 1.0, ramp, t, slope, o.degree)
                 for m in range(top):
                     slope[m] = (m + 1) * ra[m + 1]
-                _times_polynomial(g_v, signed, 1.0, ramp, t, slope, o.u_degree)
+                _times_polynomial(g_v, signed, 1.0, ramp, t, slope, o.degree)
             else:
                 samples[5:] = 0.0
             _add_row_of(row_k, size)
@@ -617,14 +641,14 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
 
 
-@nb.njit(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath=FAST)
 def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
     work = new_work(o)
     width = out.shape[2]
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
     samples = np.empty((9, width))
-    powers = np.empty((len(o.u_degree) + 1, width))
+    powers = np.empty((len(o.degree) + 1, width))
     for s in range(o.x.size):
         if maps.rows[s, 0] >= last or maps.rows[s, 1] <= first:
             continue

@@ -10,6 +10,7 @@ their Eq. 1; their simulated kernel leaves it out, and so does `conserve_flux=Fa
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -88,7 +89,7 @@ class ForwardModel:
         """The model as the compiled loops need it, with pixels integrated well for PSFs down to `narrowest` (pixel)."""
         f = np.array(self.distortion.f_terms, dtype=np.int64).reshape(-1, 4)
         g = np.array(self.distortion.g_terms, dtype=np.int64).reshape(-1, 4)
-        u_degree = max(1, int(np.concatenate([f, g])[:, 2].max()))
+        degree = max(1, int(np.concatenate([f, g])[:, 2:].max()))
         x, y = self.sources.x[:, None], self.sources.y[:, None]
         ny, nx = self.detector.shape
         offsets, weights = self.detector.quadrature(self.psf.sigma if narrowest is None else narrowest)
@@ -105,12 +106,15 @@ class ForwardModel:
             ny=ny,
             nx=nx,
             cut=-2.0 * math.log(self.tolerance) if self.tolerance > 0 else math.inf,
-            v_degree=max(1, int(np.concatenate([f, g])[:, 3].max())),
             ramp=self.detector.binning * np.arange(_kernels.stride(nx), dtype=np.float64),
-            u_degree=(0,) * u_degree,
-            q_degree=(0,) * (2 * u_degree),
-            d_degree=(0,) * (2 * u_degree - 1) if self.conserve_flux else (),
+            degree=(0,) * degree,
+            q_degree=(0,) * (2 * degree),
+            d_degree=(0,) * (2 * degree - 1) if self.conserve_flux else (),
         )
+
+    @cached_property
+    def _optics(self) -> _kernels.Optics:
+        return self.optics()
 
     def basis(self, nuisances: Sequence[str] = ()) -> _kernels.Basis:
         """What the derivatives are made of: those with respect to theta, then to the named nuisances."""
@@ -119,8 +123,7 @@ class ForwardModel:
         f = list(dict.fromkeys([t[2:] for t in d.f_terms] + constant))
         g = list(dict.fromkeys([t[2:] for t in d.g_terms] + constant))
         index = [f.index(t[2:]) for t in d.f_terms] + [len(f) + g.index(t[2:]) for t in d.g_terms]
-        optics = self.optics()
-        levers = [optics.f_lever, optics.g_lever]
+        levers = [self._optics.f_lever, self._optics.g_lever]
         for name in nuisances:
             if name == "offset_x":  # the offsets enter a and b with a minus
                 index.append(f.index((0, 0)))
@@ -155,12 +158,9 @@ class ForwardModel:
             If `theta` has another shape.
         """
         ny, nx = self.detector.shape
-        out = np.zeros(ny * _kernels.stride(nx))
-        optics = self.optics()
-        _kernels.image(optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
-        counts = out.reshape(ny, -1)[:, :nx]
-        counts += background
-        return counts
+        out = np.full(ny * _kernels.stride(nx), float(background))
+        _kernels.image(self._optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
+        return out.reshape(ny, -1)[:, :nx]
 
     def jacobian(self, theta: npt.ArrayLike) -> Floats:
         """Derivatives of the expected counts with respect to theta.
@@ -178,7 +178,7 @@ class ForwardModel:
         """
         ny, nx = self.detector.shape
         out = np.zeros((self.distortion.n_terms, ny, _kernels.stride(nx)))
-        _kernels.jacobian(self.optics(), self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out)
+        _kernels.jacobian(self._optics, self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out)
         return out[:, :, :nx]
 
     def _check(self, theta: npt.ArrayLike) -> Floats:

@@ -55,16 +55,18 @@ from bayesfred.imaging._kernels import (
     Ints,
     Maps,
     add_jacobian_rows,
-    add_pixels,
     add_source,
     add_templates,
     as_bits,
     as_float,
     basis_row,
     footprints,
+    inner,
     locate,
+    move,
     new_maps,
     new_work,
+    row_starts,
 )
 
 Flags = npt.NDArray[np.uint8]
@@ -113,22 +115,23 @@ class Clusters(NamedTuple):
 
 @nb.njit(fastmath=FAST, inline="always")
 def log(x):
-    """log(x) of a positive normal number to 3e-16 (absolute near 1): the mantissa m in [0.7, 1.41] by bits, then 2 artanh."""
+    """log(x) of a positive normal number to 3e-16 (absolute near 1).
+
+    The mantissa m in [0.7, 1.41] by bits, then 2 artanh(s) with s = (m - 1) / (m + 1): 2 s + 2 s^3 p(s^2), p being the polynomial
+    of degree 6 nearest to 1/3 + z/5 + z^2/7 + ... (Remez, 5e-18 of the result).
+    """
     bits = as_bits(x)
     k = (bits - 4604544271217802189) >> 52  # exponent, counted from sqrt(1/2)
     m = as_float(bits - (k << 52))
     s = (m - 1.0) / (m + 1.0)
     z = s * s
-    p = 1.0 / 21.0
-    p = p * z + 1.0 / 19.0
-    p = p * z + 1.0 / 17.0
-    p = p * z + 1.0 / 15.0
-    p = p * z + 1.0 / 13.0
-    p = p * z + 1.0 / 11.0
-    p = p * z + 1.0 / 9.0
-    p = p * z + 1.0 / 7.0
-    p = p * z + 0.2
-    p = p * z + 1.0 / 3.0
+    p = 7.3089406919315180756e-02
+    p = p * z + 7.6657981172986236734e-02
+    p = p * z + 9.0914466202426646721e-02
+    p = p * z + 1.1111105536283593608e-01
+    p = p * z + 1.4285714313200197706e-01
+    p = p * z + 1.9999999999949222791e-01
+    p = p * z + 3.3333333333333348644e-01
     return k * 6.93147180369123816490e-01 + (2.0 * s + (2.0 * s * z * p + k * 1.90821492927058770002e-10))
 
 
@@ -142,36 +145,39 @@ def new_workspace(ny, pitch):
     return Workspace(np.zeros(size), np.zeros(size // SEGMENT, np.uint8), span, np.empty(size), np.empty(size))
 
 
-@nb.njit(cache=True)
-def _mark(flags, span, per_row, j, low, n):
-    """Mark the segments that n pixels of row j from `low` on lie in."""
-    a = low // SEGMENT
-    b = (low + n - 1) // SEGMENT
-    span[j, 0] = min(span[j, 0], a)
-    span[j, 1] = max(span[j, 1], b)
-    for k in range(j * per_row + a, j * per_row + b + 1):
-        flags[k] = 1
-
-
-@nb.njit(cache=True)
+@inner(cache=True)
 def _mark_sources(fp, w):
-    flags, span = w.flags, w.span
+    """Mark the segments that the sources' rows of pixels lie in."""
+    flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
     per_row = flags.size // span.shape[0]
-    for i in range(fp.row.size):
-        _mark(flags, span, per_row, fp.row[i], fp.low[i], fp.size[i])
+    pitch = per_row + 1
+    change = np.zeros(span.shape[0] * pitch, np.int32)  # in the number of rows on a segment: two writes for a row of any length
+    for i in range(rows.size):
+        j, a, b = rows[i], lows[i] // SEGMENT, (lows[i] + sizes[i] - 1) // SEGMENT
+        span[j, 0] = min(span[j, 0], a)
+        span[j, 1] = max(span[j, 1], b)
+        change[j * pitch + a] += 1
+        change[j * pitch + b + 1] -= 1
+    for j in range(span.shape[0]):
+        depth = 0
+        for k in range(span[j, 0], span[j, 1] + 1):
+            depth += change[j * pitch + k]
+            flags[j * per_row + k] = depth > 0
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _mark_counted(counts, w):
     """Mark every segment with a pixel in the likelihood: a background that varies must be visited everywhere."""
     per_row = w.flags.size // w.span.shape[0]
     for j in range(w.span.shape[0]):
         for k in range(per_row):
             if counts.segment_pixels[j * per_row + k] > 0.0:
-                _mark(w.flags, w.span, per_row, j, k * SEGMENT, SEGMENT)
+                w.flags[j * per_row + k] = 1
+                w.span[j, 0] = min(w.span[j, 0], k)
+                w.span[j, 1] = max(w.span[j, 1], k)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _next_run(flags, span, per_row, j, k):
     """The next marked stretch of row j at or after segment k, as segments [start, stop); start < 0 if there is none."""
     last = span[j, 1]
@@ -200,7 +206,7 @@ def clear(w):
             w.span[j, 1] = -1
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _background_row(background, j, ny):
     """Coefficients of the background polynomial on row j in powers of u; u, v run from -1 to 1 over the frame."""
     v = (2 * j - ny + 1) / ny
@@ -208,22 +214,35 @@ def _background_row(background, j, ny):
     return c0, background[1] + v * background[4], background[3]
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
-def _poisson_run(image, values, u, step, c0, c1, c2):
-    """Sum of n log(mu) - mu over the unmasked pixels of a stretch, and how many of these have no positive mu."""
-    total = 0.0
-    impossible = 0.0  # counted, not min(mu): a minimum would keep the loop from vectorising
+@inner(cache=True, fastmath=FAST)
+def _slope_run(image, u, step, c1, c2):
+    """Add the part of the background that varies along a stretch."""
     for i in range(image.size):
         x = u + step * i
-        mu = image[i] + (c0 + x * (c1 + x * c2))
+        image[i] += x * (c1 + x * c2)
+
+
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
+def _poisson_run(image, values, level):
+    """Sum of n log(mu) - mu over the unmasked pixels of a stretch; MASKED or less if one of these has no positive mu."""
+    total = 0.0
+    for i in range(image.size):
+        mu = image[i] + level
         n = values[i]
-        term = n * log(max(mu, 1e-300)) - mu
+        term = n * log(mu) - mu if mu > 0.0 else MASKED  # neither a branch nor a minimum: the loop would not vectorise
         total += term if n > LIMIT else 0.0
-        impossible += 1.0 if (n > LIMIT and mu <= 0.0) else 0.0
-    return total, impossible
+    return total
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(cache=True, fastmath=REDUCE)
+def _sum(values):
+    total = 0.0
+    for i in range(values.size):
+        total += values[i]
+    return total
+
+
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
 def _square_run(image, values, level):
     """Sum of (n - mu)^2 over the unmasked pixels of a stretch."""
     total = 0.0
@@ -233,13 +252,12 @@ def _square_run(image, values, level):
     return total
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _log_likelihood(counts, w, background):
     """Log-likelihood of the workspace's image plus the background; what depends on the counts alone is left out."""
     ny = w.span.shape[0]
     per_row = w.flags.size // ny
-    step = 2.0 / counts.nx
-    total, impossible = 0.0, 0.0
+    total = 0.0
     pixels, rest = counts.pixels, counts.total
     for j in range(ny):
         c0, c1, c2 = _background_row(background, j, ny)
@@ -247,16 +265,14 @@ def _log_likelihood(counts, w, background):
         while start >= 0:
             a = (j * per_row + start) * SEGMENT
             b = (j * per_row + stop) * SEGMENT
+            if counts.varies:
+                _slope_run(w.image[a:b], (2 * start * SEGMENT - counts.nx + 1) / counts.nx, 2.0 / counts.nx, c1, c2)
             if counts.kind == POISSON:
-                u = (2 * start * SEGMENT - counts.nx + 1) / counts.nx
-                part, bad = _poisson_run(w.image[a:b], counts.values[a:b], u, step, c0, c1, c2)
-                impossible += bad
+                total += _poisson_run(w.image[a:b], counts.values[a:b], c0)
             else:
-                part = _square_run(w.image[a:b], counts.values[a:b], c0)
-            total += part
-            for k in range(j * per_row + start, j * per_row + stop):
-                pixels -= counts.segment_pixels[k]
-                rest -= counts.segment_sum[k]
+                total += _square_run(w.image[a:b], counts.values[a:b], c0)
+            pixels -= _sum(counts.segment_pixels[j * per_row + start : j * per_row + stop])
+            rest -= _sum(counts.segment_sum[j * per_row + start : j * per_row + stop])
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)
     level = background[0]
     if counts.kind == GAUSSIAN:  # afresh: what is left of the totals would have lost its digits to bright sources
@@ -266,7 +282,7 @@ def _log_likelihood(counts, w, background):
                 pixels += counts.segment_pixels[k]
                 rest += counts.segment_sum[k]
                 squares += counts.segment_squares[k]
-    if impossible > 0.0 or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
+    if total < LIMIT or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
         return -math.inf
     if counts.kind == GAUSSIAN:
         total += squares - 2.0 * level * rest + level * level * pixels
@@ -276,18 +292,13 @@ def _log_likelihood(counts, w, background):
     return total
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _stamps(o, maps, fp, sigma):
     """Every source's image at unit flux, row after row; shape (1, samples)."""
     out = np.zeros((1, fp.start[fp.row.size]))
     work = new_work(o)
     for s in range(o.x.size):
-        a, b, peak = maps.a[s], maps.b[s], maps.peak[s]
-        for i in range(fp.first[s], fp.first[s + 1]):
-            w = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step - peak[1]
-            t = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step - peak[0]
-            row = out[0, fp.start[i] : fp.start[i + 1]]
-            add_pixels(row, w, t, a, b, o.offsets, o.weights, o.ramp, sigma, 1.0, work, o.u_degree, o.q_degree, o.d_degree)
+        add_source(o, maps, fp, s, sigma, 1.0, fp.start, out[0], work)
     return out
 
 
@@ -300,29 +311,27 @@ class Rows(NamedTuple):
     work: Floats
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _new_rows(o, basis, width):
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
-    return Rows(rows, np.empty((9, width)), np.empty((len(o.u_degree) + 1, width)), new_work(o))
+    return Rows(rows, np.empty((9, width)), np.empty((len(o.degree) + 1, width)), new_work(o))
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _constants():
     """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of a template T."""
     one = np.zeros((1, 2), np.int64)
     return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
 
 
-@nb.njit(cache=True)
-def _move(o, maps, fp, s, sigma, flux, by_x, by_y, stamps, work):
-    """Shift source s, and make its rows of the templates `stamps`, shape (3, samples), anew."""
-    maps.a[s, 0, 0] -= by_x
-    maps.b[s, 0, 0] -= by_y
+@inner(cache=True)
+def _make_templates(o, maps, fp, s, sigma, flux, stamps, work):
+    """Fill the rows of source s in the templates `stamps`, shape (3, samples)."""
     stamps[:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] = 0.0
-    add_templates(o, maps, fp, s, sigma, flux, stamps, work)
+    add_templates(o, maps, fp, s, sigma, flux, stamps[0], stamps[1], stamps[2], work)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _boxes(fp):
     """First row, last row + 1, first column, last column + 1 of every footprint."""
     size = fp.first.size - 1
@@ -330,17 +339,34 @@ def _boxes(fp):
     for s in range(size):
         a, b = fp.first[s], fp.first[s + 1]
         if b > a:
-            boxes[s, 0], boxes[s, 1] = fp.row[a], fp.row[b - 1] + 1
-            boxes[s, 2], boxes[s, 3] = np.min(fp.low[a:b]), np.max(fp.low[a:b] + fp.size[a:b])
+            boxes[s, 0], boxes[s, 1], boxes[s, 2] = fp.row[a], fp.row[b - 1] + 1, fp.low[a]
+            for i in range(a, b):
+                boxes[s, 2] = min(boxes[s, 2], fp.low[i])
+                boxes[s, 3] = max(boxes[s, 3], fp.low[i] + fp.size[i])
     return boxes
 
 
-@nb.njit(cache=True)
-def _clusters(boxes, templates):
+@inner(cache=True)
+def _group(keys, size):
+    """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
+    first = np.zeros(size + 2, np.int64)
+    for i in range(keys.size):
+        first[keys[i] + 2] += 1
+    for k in range(size):
+        first[k + 1] += first[k]
+    order = np.empty(keys.size, np.int64)
+    for i in range(keys.size):  # after which first[k + 1] has moved from the beginning of key k to its end
+        order[first[keys[i] + 1]] = i
+        first[keys[i] + 1] += 1
+    return order, first[:-1]
+
+
+@inner(cache=True)
+def _clusters(boxes, ny, templates):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
     parent = np.arange(size)
-    order = np.argsort(boxes[:, 0], kind="mergesort")
+    order = _group(boxes[:, 0], ny)[0]
     for i in range(size):
         s = order[i]
         for k in range(i + 1, size):
@@ -367,18 +393,14 @@ def _clusters(boxes, templates):
             groups += 1
         else:
             label[s] = label[p]
-    members = np.argsort(label, kind="mergesort")
-    first = np.zeros(groups + 1, np.int64)
-    for s in range(size):
-        first[label[s] + 1] += 1
+    members, first = _group(label, groups)
     start = np.zeros(groups + 1, np.int64)
     for c in range(groups):
-        start[c + 1] = start[c] + (templates * first[c + 1]) ** 2
-        first[c + 1] += first[c]
+        start[c + 1] = start[c] + (templates * (first[c + 1] - first[c])) ** 2
     return Clusters(members, first, start)
 
 
-@nb.njit(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
 def _dot(a, b, weight):
     total = 0.0
     for i in range(a.size):
@@ -386,7 +408,7 @@ def _dot(a, b, weight):
     return total
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _gram(fp, boxes, members, stamps, weight, pitch, out):
     """out[i, k] = sum over pixels of weight T_i T_k, both triangles; a source's templates follow each other."""
     size = stamps.shape[0]
@@ -411,7 +433,7 @@ def _gram(fp, boxes, members, stamps, weight, pitch, out):
             out[k * size : (k + 1) * size, i * size : (i + 1) * size] = block.T
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _cholesky(h):
     """Lower triangle in place; False where the matrix is not positive definite."""
     for i in range(h.shape[0]):
@@ -428,7 +450,7 @@ def _cholesky(h):
     return True
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _solve(lower, x):
     """x <- (L L^T)^-1 x, in place."""
     n = x.size
@@ -442,7 +464,7 @@ def _solve(lower, x):
         x[i] /= lower[i, i]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _draw(fp, s, template, amplitude, pitch, out):
     """Add amplitude times one of a source's templates, shape (samples,), to an image."""
     for i in range(fp.first[s], fp.first[s + 1]):
@@ -453,7 +475,7 @@ def _draw(fp, s, template, amplitude, pitch, out):
             target[k] += amplitude * stamp[k]
 
 
-@nb.njit(cache=True, fastmath=FAST, error_model="numpy")
+@inner(cache=True, fastmath=FAST, error_model="numpy")
 def _weigh_run(image, values, u, step, c0, c1, c2, score, weight):
     """score = n/mu - 1 and weight = n/mu^2, zero where masked."""
     for i in range(image.size):
@@ -464,7 +486,7 @@ def _weigh_run(image, values, u, step, c0, c1, c2, score, weight):
         weight[i] = n * inverse * inverse
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _weigh_footprint(counts, w, fp, s, background, score, weight):
     """Score and weight of Poisson counts on one source's footprint."""
     ny = w.span.shape[0]
@@ -477,7 +499,7 @@ def _weigh_footprint(counts, w, fp, s, background, score, weight):
         _weigh_run(w.image[a:b], counts.values[a:b], u, 2.0 / counts.nx, c0, c1, c2, score[a:b], weight[a:b])
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _blank(fp, s, pitch, out):
     """Zero an image on one source's footprint."""
     for i in range(fp.first[s], fp.first[s + 1]):
@@ -485,7 +507,7 @@ def _blank(fp, s, pitch, out):
         out[at : at + fp.size[i]] = 0.0
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner(cache=True, error_model="numpy")
 def _largest_change(counts, w, fp, s, background, change):
     """Largest |change| / mu among one source's pixels that hold counts."""
     ny = w.span.shape[0]
@@ -501,7 +523,7 @@ def _largest_change(counts, w, fp, s, background, change):
     return largest
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _first_flux(counts, w, fp, s, stamps, background):
     """Least-squares flux of one source, its neighbours ignored."""
     ny = w.span.shape[0]
@@ -519,7 +541,7 @@ def _first_flux(counts, w, fp, s, stamps, background):
     return above / below if below > 0.0 else 0.0
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _project(fp, s, template, image, pitch):
     """Sum over a source's pixels of one of its templates times an image."""
     total = 0.0
@@ -530,7 +552,7 @@ def _project(fp, s, template, image, pitch):
     return total
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _bend(fp, s, stamps, flux, score, pitch, sigma, g):
     """Subtract from a source's block of H the second derivatives times the score, as they are for a PSF that no pixel blurs.
 
@@ -551,7 +573,7 @@ def _bend(fp, s, stamps, flux, score, pitch, sigma, g):
     g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner(cache=True, error_model="numpy")
 def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, scale, flux, shift, factors):
     """Fill `flux` and `shift` with their maximum and `factors` with the Cholesky factors of H; add the sources to the image.
 
@@ -572,7 +594,7 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
         step = np.empty(n)
         for s in members:
             if size > 1:
-                _move(o, maps, fp, s, sigma, 1.0, 0.0, 0.0, stamps, work)
+                _make_templates(o, maps, fp, s, sigma, 1.0, stamps, work)
             flux[s] = max(_first_flux(counts, w, fp, s, stamps, background), 0.01 * scale[s])
             stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= flux[s]
             _draw(fp, s, stamps[0], flux[s], pitch, w.image)
@@ -621,7 +643,8 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
                     _draw(fp, s, stamps[0], -flux[s], pitch, w.image)
                     flux[s] += by[0]
                     shift[s] += by[1:]
-                    _move(o, maps, fp, s, sigma, flux[s], by[1], by[2], stamps, work)
+                    move(o, maps, s, by[1], by[2])
+                    _make_templates(o, maps, fp, s, sigma, flux[s], stamps, work)
                     _draw(fp, s, stamps[0], flux[s], pitch, w.image)
                 else:
                     flux[s] += by[0]
@@ -649,54 +672,48 @@ class Fitted(NamedTuple):
     shifts: Floats  # (s, 2) pixel
 
 
-@nb.njit(cache=True)
-def _draw_sources(o, counts, w, maps, nuisances, background, flux, free):
-    """Put all sources into the workspace's image, profiling their fluxes, and positions that scatter, if they are free.
+class Drawn(NamedTuple):
+    """The sources as they are drawn in a workspace's image, and what the derivatives need of them."""
 
-    Returns what the profiling adds to the log-likelihood, and what it knows of the sources.
+    extra: float  # what profiling adds to the log-likelihood; -inf where a map folds, or the fluxes have no maximum
+    maps: Maps
+    fitted: Fitted
+
+
+@nb.njit(cache=True, nogil=True)
+def draw(o, counts, w, theta, nuisances, background, flux, free):
+    """Draw all sources, profiling their fluxes if they are free; whoever uses the image clears the workspace.
+
+    Nuisances are flux_scale, offset_x, offset_y, psf_sigma, position_scatter.
     """
+    maps = new_maps(o)
+    sigma, scatter = nuisances[3], nuisances[4]
+    extra = 0.0
+    if not (scatter >= 0.0 and locate(o, theta, nuisances[1], nuisances[2], sigma, 6.0 * scatter, maps)):
+        extra = -math.inf
+        maps.rows[:] = 0
     fp = footprints(o, maps)
     _mark_sources(fp, w)
     if counts.varies:
         _mark_counted(counts, w)
-    sigma, scatter = nuisances[3], nuisances[4]
-    extra = 0.0
-    boxes = _boxes(fp)
     templates = 3 if scatter > 0.0 else 1
-    clusters = _clusters(boxes[: boxes.shape[0] if free else 0], templates)
+    boxes = _boxes(fp) if free else np.empty((0, 4), np.int64)
+    clusters = _clusters(boxes, o.ny, templates)
     factors = np.empty(clusters.start[-1])
     fluxes, shifts = np.empty(flux.size), np.zeros((flux.size, 2))
     if free:
         stamps = np.empty((3, fp.start[fp.row.size])) if templates == 3 else _stamps(o, maps, fp, sigma)
-        extra = _profile(
+        extra += _profile(
             o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, 0.5 * flux, fluxes, shifts, factors
         )
     else:
         stamps = np.empty((1, 0))
         work = new_work(o)
+        at = row_starts(fp, w.image.size // o.ny)
         for s in range(o.x.size):
             fluxes[s] = nuisances[0] * flux[s]
-            add_source(o, maps, fp, s, sigma, fluxes[s], w.image, work)
-    return extra, Fitted(fp, boxes, clusters, stamps, factors, fluxes, shifts)
-
-
-@nb.njit(cache=True)
-def _locate(o, theta, nuisances, maps):
-    """Fill `maps`, with windows that hold every source while it moves within 6 standard deviations; False if impossible."""
-    return nuisances[4] >= 0.0 and locate(o, theta, nuisances[1], nuisances[2], nuisances[3], 6.0 * nuisances[4], maps)
-
-
-@nb.njit(cache=True)
-def _log_likelihood_at(o, counts, w, theta, nuisances, background, flux, free):
-    """Log-likelihood for one set of parameters; nuisances are flux_scale, offset_x, offset_y, psf_sigma, position_scatter."""
-    maps = new_maps(o)
-    if not _locate(o, theta, nuisances, maps):
-        return -math.inf
-    value = _draw_sources(o, counts, w, maps, nuisances, background, flux, free)[0]
-    if value > -math.inf:
-        value += _log_likelihood(counts, w, background)
-    clear(w)
-    return value
+            add_source(o, maps, fp, s, sigma, fluxes[s], at, w.image, work)
+    return Drawn(extra, maps, Fitted(fp, boxes, clusters, stamps, factors, fluxes, shifts))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -704,31 +721,13 @@ def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, firs
     """Log-likelihoods of rows first, first + step, ... into `out`; rows where it is -inf already are left alone."""
     for i in range(first, out.size, step):
         if out[i] > -math.inf:
-            out[i] = _log_likelihood_at(o, counts, w, theta[i], nuisances[i], background[i], flux, free)
+            out[i] = draw(o, counts, w, theta[i], nuisances[i], background[i], flux, free).extra
+            if out[i] > -math.inf:
+                out[i] += _log_likelihood(counts, w, background[i])
+            clear(w)
 
 
-class Drawn(NamedTuple):
-    """The sources as they are drawn in a workspace's image, and what the derivatives need of them."""
-
-    possible: bool  # False where a map folds, or the fluxes have no maximum
-    likely: bool  # whether the likelihood is not zero
-    maps: Maps
-    fitted: Fitted
-
-
-@nb.njit(cache=True, nogil=True)
-def draw(o, counts, w, theta, nuisances, background, flux, free):
-    """Draw all sources; whoever uses the image clears the workspace."""
-    maps = new_maps(o)
-    possible = _locate(o, theta, nuisances, maps)
-    if not possible:
-        maps.rows[:] = 0
-    extra, fitted = _draw_sources(o, counts, w, maps, nuisances, background, flux, free)
-    possible = possible and extra > -math.inf
-    return Drawn(possible, possible and _log_likelihood(counts, w, background) > -math.inf, maps, fitted)
-
-
-@nb.njit(cache=True)
+@inner(cache=True)
 def _weigh(counts, w, background, curve):
     """Score d log L/d mu and weight -d^2 log L/d mu^2 of every marked pixel; curve = -1/2 d weight/d mu."""
     ny = w.span.shape[0]
@@ -750,7 +749,7 @@ def _weigh(counts, w, background, curve):
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _mix(fp, boxes, members, stamps, inverse, out):
     """The templates q = Q T of a cluster's sources, added to `out`."""
     size = stamps.shape[0]
@@ -770,7 +769,7 @@ def _mix(fp, boxes, members, stamps, inverse, out):
                                 out[a, fp.start[p] + k - fp.low[p]] += factor * stamps[b, fp.start[q] + k - fp.low[q]]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, g):
     """What a source's second derivatives K_xx, K_xy, K_yy and X, Y as dK add to its rows of e and G."""
     fp, stamps, flux = drawn.fitted.footprints, drawn.fitted.stamps, drawn.fitted.fluxes[s]
@@ -798,7 +797,7 @@ def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, g):
     g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
     """z, the templates q, the image A and the derivative by tau of the module's derivation."""
     fp, boxes, clusters, stamps, factors, flux, shift = drawn.fitted
@@ -862,8 +861,10 @@ def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
 def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_background):
     """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`.
 
-    Returns the derivative with respect to position_scatter.
+    Returns the derivative with respect to position_scatter, NaN where the likelihood is zero.
     """
+    if not drawn.extra + _log_likelihood(counts, w, background) > -math.inf:
+        return math.nan
     maps, fp, fluxes, sigma = drawn.maps, drawn.fitted.footprints, drawn.fitted.fluxes, nuisances[3]
     size = drawn.fitted.stamps.shape[0]
     curve = np.empty(w.image.size)
@@ -897,7 +898,7 @@ def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_b
     return slope
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _background_gradient(counts, w, background, image, out):
     """Sum of the image times 1, u, v, u^2, uv, v^2 over the likelihood's pixels."""
     ny = w.span.shape[0]
@@ -924,7 +925,7 @@ def _background_gradient(counts, w, background, image, out):
         out[0] += rest / background[0] - pixels if counts.kind == POISSON else (rest - background[0] * pixels) / background[0]
 
 
-@nb.njit(cache=True)
+@inner(cache=True)
 def _fisher_weight(counts, w, background):
     """Expected information 1 / variance per marked pixel into w.weight, zero where masked; returns the unmarked pixels."""
     ny = w.span.shape[0]
@@ -956,8 +957,11 @@ def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
     I - C H^-1 C^T over the sources' templates, where H carries the priors' curvature.
 
     Returns the information about position_scatter: a coordinate measured with variance s^2 scatters by tau^2 + s^2 about
-    the catalogue's, which gives 2 tau^2 / (tau^2 + s^2)^2 = 2 (tau^2 - Q)^2 / tau^6 with Q its variance given the prior.
+    the catalogue's, which gives 2 tau^2 / (tau^2 + s^2)^2 = 2 (tau^2 - Q)^2 / tau^6 with Q its variance given the prior. NaN where
+    the likelihood is zero.
     """
+    if not drawn.extra + _log_likelihood(counts, w, background) > -math.inf:
+        return math.nan
     fp, boxes, clusters, stamps, factors, fitted, _ = drawn.fitted
     sigma, scatter, templates = nuisances[3], nuisances[4], stamps.shape[0]
     pixels = _fisher_weight(counts, w, background)

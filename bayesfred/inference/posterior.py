@@ -6,7 +6,7 @@ derivatives are in `_kernels.py`; `estimate.py` finds the maximum, `sampling.py`
 
 import os
 import queue
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -333,11 +333,7 @@ class Posterior:
 
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
-        vectors = self._vectors(params)
-        total = np.zeros(len(vectors))
-        for k, distribution in enumerate(self.prior.values()):
-            total += distribution.logpdf(vectors[:, k])
-        return total
+        return self._log_prior(self._vectors(params))
 
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
@@ -347,11 +343,11 @@ class Posterior:
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
         with self._drawn(arguments) as (w, drawn):
-            if not drawn.likely:
-                return np.full(vector.size, np.nan)
             slope = _kernels.gradient(
                 self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background
             )
+        if np.isnan(slope):
+            return np.full(vector.size, np.nan)
         if isinstance(self.noise, BackgroundNoise):
             level = arguments[2][0]
             residual = self.counts - self.expected_counts(vector)
@@ -380,9 +376,9 @@ class Posterior:
         size = self._basis.row.size + terms
         out = np.zeros((size, size))
         with self._drawn(arguments) as (w, drawn):
-            if not drawn.likely:
-                return np.full((vector.size, vector.size), np.nan)
             known = _kernels.fisher(self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free, self._basis, out)
+        if np.isnan(known):
+            return np.full((vector.size, vector.size), np.nan)
         if self.nuisances.position_scatter:  # independent of the others: it is known by the shifts' size alone
             k = self._basis.row.size
             out = np.insert(np.insert(out, k, 0.0, axis=0), k, 0.0, axis=1)
@@ -428,7 +424,7 @@ class Posterior:
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
         u, v = (np.arange(1 - n, n, 2) / n for n in (nx, ny))
         background = np.polynomial.polynomial.polyval2d(*np.meshgrid(u, v), _square(arguments[2]))
-        bad = 0.0 if drawn.possible else np.nan
+        bad = 0.0 if drawn.extra > -np.inf else np.nan
         return sources + background - self.noise.shift + bad, drawn.fitted.fluxes + bad
 
     def start(self) -> Floats:
@@ -450,11 +446,14 @@ class Posterior:
 
     def _arguments(self, vectors: Floats) -> tuple[Floats, Floats, Floats]:
         """Distortion coefficients, source nuisances and background coefficients, one row a parameter vector."""
-        column = {name: vectors[:, k] for k, name in enumerate(self.parameter_names)}
-        n = len(vectors)
-        fixed = {"flux_scale": 1.0, "psf_sigma": self.model.psf.sigma}
-        nuisances = np.stack([column.get(name, np.full(n, fixed.get(name, 0.0))) for name in SOURCE_NUISANCES], axis=1)
-        background = np.stack([column.get(name, np.zeros(n)) for name in BACKGROUND_TERMS], axis=1)
+        nuisances = np.zeros((len(vectors), len(SOURCE_NUISANCES)))
+        background = np.zeros((len(vectors), len(BACKGROUND_TERMS)))
+        nuisances[:, SOURCE_NUISANCES.index("flux_scale")] = 1.0
+        nuisances[:, SOURCE_NUISANCES.index("psf_sigma")] = self.model.psf.sigma
+        for values, names in ((nuisances, SOURCE_NUISANCES), (background, BACKGROUND_TERMS)):
+            for k, name in enumerate(names):
+                if name in self.parameter_names:
+                    values[:, k] = vectors[:, self.parameter_names.index(name)]
         background[:, 0] += self.noise.shift
         return np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]), nuisances, background
 
@@ -485,6 +484,10 @@ class Posterior:
         """Where each parameter stands among source parameters followed by background coefficients."""
         kernel = (*self.model.distortion.names, *self.nuisances.source_names, *self.nuisances.background_names)
         return [kernel.index(name) for name in self.parameter_names]
+
+    @cached_property
+    def _log_prior(self) -> Callable[[Floats], Floats]:
+        return priors.log_density(self.prior)
 
     @cached_property
     def _optics(self) -> Optics:
