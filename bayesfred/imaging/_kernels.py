@@ -163,7 +163,7 @@ def _shift(c, h, k, degree):
                 c[m, n] += k * c[m, n + 1]
 
 
-@inner(cache=True, fastmath=FAST)
+@inner(cache=True, fastmath={"contract"})
 def _evaluate(c, u, v, degree):
     """The polynomial c and its derivatives with respect to u and v."""
     top = len(degree)

@@ -215,11 +215,11 @@ def _background_row(background, j, ny):
 
 
 @inner(cache=True, fastmath=FAST)
-def _slope_run(image, u, step, c1, c2):
-    """Add the part of the background that varies along a stretch."""
+def _slope_run(image, u, step, c1, c2, out):
+    """The image of a stretch plus the part of the background that varies along it."""
     for i in range(image.size):
         x = u + step * i
-        image[i] += x * (c1 + x * c2)
+        out[i] = image[i] + x * (c1 + x * c2)
 
 
 @inner(cache=True, fastmath=REDUCE, error_model="numpy")
@@ -265,12 +265,15 @@ def _log_likelihood(counts, w, background):
         while start >= 0:
             a = (j * per_row + start) * SEGMENT
             b = (j * per_row + stop) * SEGMENT
+            image = w.image[a:b]
             if counts.varies:
-                _slope_run(w.image[a:b], (2 * start * SEGMENT - counts.nx + 1) / counts.nx, 2.0 / counts.nx, c1, c2)
+                image = w.score[a:b]
+                u = (2 * start * SEGMENT - counts.nx + 1) / counts.nx
+                _slope_run(w.image[a:b], u, 2.0 / counts.nx, c1, c2, image)
             if counts.kind == POISSON:
-                total += _poisson_run(w.image[a:b], counts.values[a:b], c0)
+                total += _poisson_run(image, counts.values[a:b], c0)
             else:
-                total += _square_run(w.image[a:b], counts.values[a:b], c0)
+                total += _square_run(image, counts.values[a:b], c0)
             pixels -= _sum(counts.segment_pixels[j * per_row + start : j * per_row + stop])
             rest -= _sum(counts.segment_sum[j * per_row + start : j * per_row + stop])
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)
