@@ -28,7 +28,7 @@ Floats = npt.NDArray[np.float64]
 Read = TypeVar("Read")
 
 KIND = "bayesfred chain"
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True, eq=False)
