@@ -4,6 +4,7 @@ from .errors import InputError
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
 from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
+from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF
 from .imaging.scene import SourceCatalog
 from .inference.chainfile import Chain, open_chain
@@ -22,6 +23,7 @@ __all__ = [
     "GaussianPSF",
     "InputError",
     "LaplaceMove",
+    "LogDistortion",
     "MapEstimate",
     "Nuisances",
     "PoissonNoise",

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.special import xlogy
 from scipy.stats import poisson
 
-from bayesfred.analysis.diagnostics import autocorrelation_time, deviance_moments, diagnose
+from bayesfred.analysis.diagnostics import autocorrelation_time, diagnose
 from bayesfred.inference.convergence import convergence, effective_size, rank_rhat
+from bayesfred.inference.goodness import deviance_moments
 from bayesfred.inference.noise import BackgroundNoise
 from bayesfred.inference.posterior import Nuisances
 
@@ -205,7 +206,7 @@ def most_likely(counts: Floats, start: tuple[float, float], read_noise: float = 
 def chain_at(params: Floats, posterior: Any, **changes: Any) -> Any:
     """Stand-in for a chain of independent draws around `params`."""
     draws = np.random.default_rng(11).normal(size=(4, 15, 32, 2)) * 0.1 + params
-    estimate = SimpleNamespace(params=params, converged=True, message="done")
+    estimate = SimpleNamespace(params=params, at_maximum=True, message="done")
     fields = {
         "parameter_names": posterior.parameter_names,
         "chain": draws,
@@ -346,7 +347,7 @@ def shifted() -> Floats:
         ({"accepted": np.full((4, 32), 1)}, "acceptance"),
         ({"burn_in": 9}, "effective sample size"),
         ({"burn_in": 15}, "R-hat"),
-        ({"estimate": SimpleNamespace(params=np.array([1.0, 5.0]), converged=False, message="lost")}, "lost"),
+        ({"estimate": SimpleNamespace(params=np.array([1.0, 5.0]), at_maximum=False, message="lost")}, "lost"),
     ],
     ids=["ensembles disagree", "hardly accepts", "too short", "no draws", "no MAP"],
 )

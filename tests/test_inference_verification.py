@@ -133,10 +133,10 @@ def test_a_posterior_that_is_not_rebuilt_as_it_was_is_found(path: Path) -> None:
 
 def test_a_maximum_that_was_not_found_is_not_asked_for(posterior: Posterior, estimate: MapEstimate, tmp_path: Path) -> None:
     off = estimate.params + 0.3 * np.sqrt(np.diag(estimate.covariance))
-    given = replace(estimate, params=off, log_prob=posterior.log_prob(off), converged=False)
+    given = replace(estimate, params=off, log_prob=posterior.log_prob(off), converged=False, at_maximum=False)
     checks = verify(run(posterior, given, tmp_path / "chain.h5", 3).path)
     assert all(check.holds for check in checks)
-    assert finding(checks, "MAP") == "was stored as not converged"
-    given = replace(given, converged=True)
+    assert finding(checks, "MAP") == "was stored as not at the maximum"
+    given = replace(given, converged=True, at_maximum=True)
     checks = verify(run(posterior, given, tmp_path / "other.h5", 3).path)
     assert failed(checks) >= {"MAP"}

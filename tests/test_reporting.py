@@ -55,7 +55,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         expected_counts=lambda params: model.expected_counts(params[:4], params[4]),
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
     )
-    estimate = SimpleNamespace(params=centre, converged=True, message="gradient <small>", n_evaluations=9)
+    estimate = SimpleNamespace(params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9)
     fields = {
         "path": Path("chains/a & b.h5"),
         "parameter_names": names,

@@ -481,6 +481,14 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
     return unfolded
 
 
+@nb.njit(cache=True)
+def image_positions(o, theta, offset_x, offset_y, sigma):
+    """Where the sources are imaged, shape (s, 2); a source without an image stays at its place."""
+    maps = new_maps(o)
+    locate(o, theta, offset_x, offset_y, sigma, 0.0, maps)
+    return maps.peak
+
+
 class Basis(NamedTuple):
     """What derivatives are made of: the unit-flux kernel's derivative with respect to single monomials of f and g.
 

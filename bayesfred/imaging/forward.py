@@ -20,6 +20,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging import _kernels
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 
@@ -41,8 +42,8 @@ class ForwardModel:
         Positions (pixel) and fluxes (counts) in the object plane.
     psf : GaussianPSF
         Reference PSF at the axis.
-    distortion : PolynomialDistortion
-        The terms of f and g.
+    distortion : PolynomialDistortion or LogDistortion
+        The terms of f and g. What is not polynomial can be simulated, not fitted: it has expected counts alone.
     conserve_flux : bool
         Whether the kernel carries |D|. False is the kernel as the paper prints it.
     tolerance : float
@@ -72,7 +73,7 @@ class ForwardModel:
     detector: Detector
     sources: SourceCatalog
     psf: GaussianPSF
-    distortion: PolynomialDistortion
+    distortion: PolynomialDistortion | LogDistortion
     conserve_flux: bool = field(default=True, kw_only=True)
     tolerance: float = field(default=1e-8, kw_only=True)
 
@@ -87,6 +88,8 @@ class ForwardModel:
 
     def optics(self, narrowest: float | None = None) -> _kernels.Optics:
         """The model as the compiled loops need it, with pixels integrated well for PSFs down to `narrowest` (pixel)."""
+        if isinstance(self.distortion, LogDistortion):
+            raise InputError("distortion: got LogDistortion, expected PolynomialDistortion: what is not polynomial is not fitted")
         f = np.array(self.distortion.f_terms, dtype=np.int64).reshape(-1, 4)
         g = np.array(self.distortion.g_terms, dtype=np.int64).reshape(-1, 4)
         degree = max(1, int(np.concatenate([f, g])[:, 2:].max()))
@@ -158,9 +161,25 @@ class ForwardModel:
             If `theta` has another shape.
         """
         ny, nx = self.detector.shape
+        if isinstance(self.distortion, LogDistortion):
+            return self._every_pixel() + background
         out = np.full(ny * _kernels.stride(nx), float(background))
         _kernels.image(self._optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
         return out.reshape(ny, -1)[:, :nx]
+
+    def _every_pixel(self) -> Floats:
+        """The sources' image without compiled loops: every pixel for every source, any distortion."""
+        offsets, weights = self.detector.quadrature(self.psf.sigma)
+        u, v = (np.add.outer(centres, offsets) for centres in self.detector.pixel_centres())
+        u, v, width = u[None, None], v[:, :, None, None], self.psf.sigma
+        out = np.zeros(self.detector.shape)
+        for x, y, flux in zip(self.sources.x, self.sources.y, self.sources.flux, strict=True):
+            f, g = self.distortion.displacement((), u, v, x, y)
+            kernel = flux * self.psf.peak * np.exp(-0.5 * ((u - x + f) ** 2 + (v - y + g) ** 2) / width**2)
+            if self.conserve_flux:
+                kernel *= np.abs(self.distortion.determinant((), u, v, x, y))
+            out += np.einsum("jqip,q,p->ji", kernel, weights, weights, optimize=True)
+        return out
 
     def jacobian(self, theta: npt.ArrayLike) -> Floats:
         """Derivatives of the expected counts with respect to theta.

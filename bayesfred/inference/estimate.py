@@ -1,8 +1,4 @@
-"""The posterior's maximum and its Laplace approximation.
-
-scipy's trust-region method gets the exact gradient and, as Hessian, the Fisher information plus the prior's curvature,
-which is positive definite everywhere. The search runs in coordinates in which that matrix is the identity at the start.
-"""
+"""The posterior's maximum and its Laplace approximation: `start.py` says where to begin, `ascent.py` climbs, here it is judged."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,16 +6,25 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, optimize
+from scipy import linalg
 
 from bayesfred.errors import InputError
 from bayesfred.inference import priors
+from bayesfred.inference.ascent import climb
+from bayesfred.inference.goodness import goodness
 from bayesfred.inference.posterior import Posterior
+from bayesfred.inference.start import find_start
 
 Floats = npt.NDArray[np.float64]
 
 # A combination of parameters about which the frame adds less than this share to its prior's information is not measured.
 LEAST_INFORMATION = 0.01
+
+# ... nor is it missed if it makes up less than this share of what its priors allow.
+LEAST_EFFECT = 0.01
+
+# Residuals are those of the noise where the deviance is within so many standard deviations of its expectation.
+CONSISTENT = 5.0
 
 # The maximum is found where a Newton step from it would move no parameter by more than this share of its error.
 CLOSENESS = 1e-3
@@ -38,11 +43,13 @@ class MapEstimate:
     log_prob : float
         Log-posterior density there.
     converged : bool
-        Whether the gradient vanishes within 1e-3 standard deviations.
+        Whether this is a maximum and the deviance there is what the noise makes it, within 5 standard deviations.
     n_evaluations : int
         Log-posteriors evaluated.
     message : str
-        How the search ended.
+        How the search ended and where it began; what to do where it has not converged.
+    at_maximum : bool
+        Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits.
     """
 
     params: Floats
@@ -51,13 +58,14 @@ class MapEstimate:
     converged: bool
     n_evaluations: int
     message: str
+    at_maximum: bool = True
 
     def write(self, group: Any) -> None:
         """Store the estimate in an HDF5 group."""
         group.create_dataset("params", data=self.params)
         group.create_dataset("covariance", data=self.covariance)
         group.attrs["message"] = np.bytes_(self.message.encode())
-        for name in ("log_prob", "converged", "n_evaluations"):
+        for name in ("log_prob", "converged", "n_evaluations", "at_maximum"):
             group.attrs[name] = getattr(self, name)
 
     @classmethod
@@ -71,6 +79,7 @@ class MapEstimate:
             bool(a["converged"]),
             int(a["n_evaluations"]),
             bytes(a["message"]).decode(),
+            bool(a["at_maximum"]),
         )
 
 
@@ -85,8 +94,26 @@ def undetermined(posterior: Posterior, params: Floats) -> tuple[str, ...]:
     given = np.array([priors.slope(p, x)[1] for p, x in zip(posterior.prior.values(), params, strict=True)])
     information = posterior.fisher(params) + np.diag(np.maximum(given - sd**-2.0, 0.0))
     values, vectors = np.linalg.eigh(information * np.outer(sd, sd))
-    weak = (vectors[:, values < LEAST_INFORMATION] ** 2).sum(axis=1) > 0.1
+    lost = (values < LEAST_INFORMATION) & (_effect(posterior, sd, vectors) > LEAST_EFFECT)
+    weak = (vectors[:, lost] ** 2).sum(axis=1) > 0.1
     return tuple(name for name, is_weak in zip(posterior.parameter_names, weak, strict=True) if is_weak)
+
+
+def _effect(posterior: Posterior, sd: Floats, vectors: Floats) -> Floats:
+    """How much of what the priors allow to happen each direction is: unit vectors, columns, in units of `sd`.
+
+    Of the coefficients what counts is the mean square by which they move points all over the frame, to first order, where
+    u = x and v = y. Directions that only exchange u for x, such as u x against x^2, move nothing: where the distortion
+    is small no frame tells these terms apart, and nothing depends on it.
+    """
+    d = posterior.model.distortion
+    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
+    x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, 9).T))
+    powers = np.array([*d.f_terms, *d.g_terms])
+    moves = sd[: d.n_terms] * x[:, None] ** (powers[:, 0] + powers[:, 2]) * y[:, None] ** (powers[:, 1] + powers[:, 3])
+    f = np.arange(d.n_terms) < len(d.f_terms)
+    squares = sum(((moves[:, part] @ vectors[: d.n_terms][part]) ** 2).sum(axis=0) for part in (f, ~f))
+    return np.asarray(squares / (moves**2).sum() + (vectors[d.n_terms :] ** 2).sum(axis=0))
 
 
 def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None) -> MapEstimate:
@@ -121,7 +148,12 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     >>> find_map(posterior).converged
     True
     """
-    origin = posterior.start() if start is None else np.array(start, dtype=np.float64)
+    if start is None:
+        begun = find_start(posterior)
+        origin = begun.params
+        how = f" from {begun.path}, {begun.matched} of {len(posterior.model.sources)} sources matched"
+    else:
+        origin, how = np.array(start, dtype=np.float64), ""
     if not np.isfinite(posterior.log_prob(origin)):
         raise InputError("start: the posterior has no density there, expected parameters within the prior whose map does not fold")
     weak = undetermined(posterior, origin)
@@ -130,39 +162,37 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
             f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than their "
             "noise: leave out terms, add sources, or give these parameters a narrower prior"
         )
-    whiten = linalg.inv(linalg.cholesky(posterior.information(origin), lower=True)).T
-    n_evaluations = 0
+    top = climb(posterior, origin)
+    at_maximum = top.distance < CLOSENESS
+    excess = _excess(posterior, top.params)
+    message = f"gradient {top.distance:.1g} standard deviations from zero after {top.evaluations} evaluations{how}"
+    if not at_maximum:
+        message = f"not found, {message}: begin elsewhere (start), fit fewer terms, or narrow the priors"
+    elif not abs(excess) <= CONSISTENT:
+        message = f"found, {message}; {_advice(excess)}"
+    else:
+        message = f"found, {message}; residuals as the noise makes them"
+    converged = at_maximum and abs(excess) <= CONSISTENT
+    return MapEstimate(top.params, top.covariance, top.log_prob, converged, top.evaluations, message, at_maximum)
 
-    def place(z: Floats) -> Floats:
-        return np.asarray(origin + whiten @ z)
 
-    def cost(z: Floats) -> float:
-        nonlocal n_evaluations
-        n_evaluations += 1
-        return -float(posterior.log_prob(place(z)))
+def _excess(posterior: Posterior, params: Floats) -> float:
+    """By how many standard deviations the deviance differs from what noise alone makes of it."""
+    fit = goodness(posterior, params)
+    return float((fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"])
 
-    def curvature(z: Floats) -> Floats:
-        matrix = whiten.T @ posterior.information(place(z)) @ whiten
-        # NaN where there is no density; scipy asks there too, before it steps back
-        return matrix if np.isfinite(matrix).all() else np.eye(z.size)
 
-    result = optimize.minimize(
-        cost,
-        np.zeros(origin.size),
-        method="trust-exact",
-        jac=lambda z: -(whiten.T @ posterior.gradient(place(z))),
-        hess=curvature,
-        options={"gtol": 1e-7, "maxiter": 300, "initial_trust_radius": 100.0, "max_trust_radius": 1e6},
+def _advice(excess: float) -> str:
+    """What to do about residuals that are not those of the noise."""
+    if excess > 0:
+        return (
+            f"but the residuals exceed the noise (deviance {excess:.0f} standard deviations above its expectation): look at "
+            "them for sources that the catalogue lacks or the frame misses, a PSF or fluxes that are not right, or terms left out"
+        )
+    return (
+        f"but the residuals are less than the noise (deviance {-excess:.0f} standard deviations below its expectation): check "
+        "gain and read noise"
     )
-    params = place(result.x)
-    covariance = inverse(posterior.information(params))
-    gradient = posterior.gradient(params)
-    distance = float(np.sqrt(np.maximum(gradient @ covariance @ gradient, 0.0)))
-    converged = distance < CLOSENESS
-    message = f"gradient {distance:.1g} standard deviations from zero after {result.nit} iterations"
-    if not converged:
-        message += ": begin elsewhere (start), or fit fewer terms first"
-    return MapEstimate(params, covariance, -float(result.fun), converged, n_evaluations, message)
 
 
 def inverse(matrix: Floats) -> Floats:

@@ -17,6 +17,7 @@ from scipy.special import xlogy
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.logarithm import LogDistortion
 
 Floats = npt.NDArray[np.float64]
 
@@ -119,7 +120,9 @@ def slope(distribution: Any, x: float) -> tuple[float, float]:
     return float(first) / scale, float(second) / scale**2
 
 
-def default_prior(name: str, distortion: PolynomialDistortion, detector: Detector, level: float, sigma: float) -> Any:
+def default_prior(
+    name: str, distortion: PolynomialDistortion | LogDistortion, detector: Detector, level: float, sigma: float
+) -> Any:
     """The prior of a parameter for which the user gave none.
 
     A distortion coefficient is normal with the scale at which its term moves a star at the frame's corner by 10 % of
@@ -132,7 +135,7 @@ def default_prior(name: str, distortion: PolynomialDistortion, detector: Detecto
     Parameters
     ----------
     name : str
-    distortion : PolynomialDistortion
+    distortion : PolynomialDistortion or LogDistortion
     detector : Detector
     level : float, counts per pixel
         Typical level of the frame's counts.

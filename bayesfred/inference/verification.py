@@ -95,8 +95,8 @@ def _maximum(chain: Chain, posterior: Posterior) -> list[Check]:
     stored = chain.estimate
     off, share = _farthest(np.array([posterior.log_prob(stored.params)]), np.array([stored.log_prob]))
     value = Check("MAP's log-probability", f"differs by {off:.2g}", share <= 1.0)
-    if not stored.converged:
-        return [value, Check("MAP", "was stored as not converged", True)]
+    if not stored.at_maximum:
+        return [value, Check("MAP", "was stored as not at the maximum", True)]
     try:
         again = find_map(posterior, stored.params)
         lower = LaplaceMove(again.params, again.covariance).lowers[0]

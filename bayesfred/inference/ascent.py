@@ -1,0 +1,96 @@
+"""One climb to a maximum of a posterior, from a given start.
+
+The Fisher information plus the prior's curvature is positive definite everywhere. Newton steps with it in the place of the
+Hessian go far and converge fast where the model fits. Where it does not, they overshoot or crawl; there scipy's BFGS takes
+over, in coordinates in which that matrix is the identity, and learns from gradients alone how the Hessian differs from it.
+Where the map folds there is no density; the search meets the bowl that its start foretells instead.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg, optimize
+
+from bayesfred.inference.posterior import Posterior
+
+Floats = npt.NDArray[np.float64]
+
+CLOSE_ENOUGH = 3e-4  # standard deviations from the maximum, where log_prob differs from it by 5e-8; sums over frames round at 1e-9
+MOST_EVALUATIONS = 300  # after which no more searches begin
+AS_FORETOLD = 0.25  # a Newton step whose gain is what it foretells to within this part is followed by another
+
+
+class Ascent(NamedTuple):
+    """Where a climb ended.
+
+    Attributes
+    ----------
+    params : ndarray, shape (d,)
+    log_prob : float
+    covariance : ndarray, shape (d, d)
+        Inverse of Fisher information plus prior curvature there.
+    distance : float
+        Length of the gradient in standard deviations, that is of a Newton step from there; inf where there is no covariance.
+    evaluations : int
+        Log-posteriors evaluated, with a gradient each.
+    """
+
+    params: Floats
+    log_prob: float
+    covariance: Floats
+    distance: float
+    evaluations: int
+
+
+def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> Ascent:
+    """The maximum above a start at which the posterior has density, or where so many Newton steps towards it lead.
+
+    References
+    ----------
+    J. Nocedal & S. Wright, Numerical Optimization, 2nd ed., chapters 3 and 6.
+    """
+    params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
+    while True:
+        information = posterior.information(params)
+        scale = 1.0 / np.sqrt(np.diag(information))  # rows differ in scale by many orders of magnitude
+        try:
+            lower = linalg.cholesky(information * np.outer(scale, scale), lower=True)
+        except linalg.LinAlgError:  # a flat prior and a frame that says nothing
+            return Ascent(params, value, np.full_like(information, np.nan), np.inf, evaluations)
+        whiten = scale[:, None] * linalg.solve_triangular(lower, np.eye(scale.size), lower=True).T
+        slope = whiten.T @ posterior.gradient(params)
+        distance = float(np.linalg.norm(slope))
+        if distance < CLOSE_ENOUGH or evaluations >= MOST_EVALUATIONS or taken == steps:
+            break
+        step, gain, taken = whiten @ slope, -np.inf, taken + 1
+        for fraction in 0.5 ** np.arange(10):
+            gain = float(posterior.log_prob(params + fraction * step)) - value
+            evaluations += 1
+            if gain > 0.0:
+                params, value = params + fraction * step, value + gain
+                break
+        if gain > 0.0 and (steps is not None or abs(2.0 * gain / distance**2 - 1.0) < AS_FORETOLD):
+            continue
+        if steps is not None:
+            break
+        result = _search(posterior, params, value, whiten)
+        evaluations += result.nfev
+        if not (result.fun < 0.0 or gain > 0.0):
+            break
+        params, value = params + whiten @ result.x, value - result.fun
+    return Ascent(params, float(posterior.log_prob(params)), whiten @ whiten.T, distance, evaluations)
+
+
+def _search(posterior: Posterior, origin: Floats, value: float, whiten: Floats) -> optimize.OptimizeResult:
+    """BFGS on what log_prob lacks of its value at the origin."""
+
+    def cost(z: Floats) -> tuple[float, Floats]:
+        params = origin + whiten @ z
+        here = float(posterior.log_prob(params))
+        if not np.isfinite(here):
+            return 1.0 + 0.5 * float(z @ z), z
+        return value - here, -(whiten.T @ posterior.gradient(params))
+
+    options = {"gtol": CLOSE_ENOUGH, "norm": 2, "maxiter": 100}
+    return optimize.minimize(cost, np.zeros(origin.size), jac=True, method="BFGS", options=options)
