@@ -163,6 +163,10 @@ def between(value: float, edges: tuple[float, ...]) -> str:
     return f"{edges[k - 1]:g} to {edges[k]:g}"
 
 
+def order(value: str) -> tuple[float, str]:
+    return float(value.split()[0]) if " to " in value else 0.0, value
+
+
 def table(rows: Iterable[dict[str, Any]]) -> Table:
     """Share of problems in which the maximum is found, and the cost in units of a climb from the truth."""
     posed = [row for row in rows if row["truth_message"].startswith("found")]
@@ -170,7 +174,7 @@ def table(rows: Iterable[dict[str, Any]]) -> Table:
     for head in ("", "", "problems", "found", "cost", *(f"{m} ({sum(m in row for row in posed)})" for m in METHODS)):
         out.add_column(head, justify="right" if head else "left")
     for name, stratum in STRATA.items():
-        for value in sorted({stratum(row) for row in posed}, key=lambda text: float(text.split()[0]) if " to " in text else 0.0):
+        for value in sorted({stratum(row) for row in posed}, key=order):
             part = [row for row in posed if stratum(row) == value]
             cells = []
             for method in ("bayesfred", *METHODS):
@@ -220,7 +224,8 @@ def main() -> int:
     out.print(f"{len(lost)} problems without a maximum that a climb from the truth finds: {[row['number'] for row in lost]}")
     for row in rows.values():
         if row not in lost and not row["bayesfred"]["found"]:
-            out.print(f"problem {row['number']}: {row['bayesfred']['distance']:.0f} sd away: {row['bayesfred']['message']}")
+            mine = row["bayesfred"]
+            out.print(f"problem {row['number']}: log_prob {mine['higher']:+.1f} at {mine['distance']:.0f} sd: {mine['message']}")
     out.print(logarithm())
     return 0
 
