@@ -222,7 +222,7 @@ def reference_attribute(file: h5py.File) -> None:
     file["versions"].attrs["numpy"] = file["/"].ref
 
 
-@harm("/versions/?[31m red?: got a soft")
+@harm(r"/versions/\x1b[31m\nred\x07: got a soft")
 def name_that_a_terminal_obeys(file: h5py.File) -> None:
     file["versions/\x1b[31m\nred\x07"] = h5py.SoftLink("/")
 

@@ -73,15 +73,10 @@ def examined(path: Path) -> Iterator[h5py.File]:
                 _check_tree(file.id, size)
                 yield file
     except InputError as error:
-        raise InputError(f"{path}: {_shown(error)}") from None
+        raise InputError(f"{path}: {error}") from None
     except (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged ({_shown(error)}), expected a whole chain file: {MEND}") from None
-
-
-def _shown(error: Exception) -> str:
-    """What an error says, on one line and without what a terminal would obey; names in a file are anybody's."""
-    text = " ".join(str(error).split())
-    return "".join(c if c.isprintable() else "?" for c in text)[:400]
+        reason = " ".join(str(error).split())[:400]
+        raise InputError(f"{path}: damaged ({reason}), expected a whole chain file: {MEND}") from None
 
 
 def _check_seal(stream: BinaryIO) -> int:
