@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 
 CLOSE_ENOUGH = 3e-4  # standard deviations from the maximum, where log_prob differs from it by 5e-8; sums over frames round at 1e-9
 MOST_EVALUATIONS = 300  # after which no more searches begin
-AS_FORETOLD = 0.25  # a Newton step whose gain is what it foretells to within this part is followed by another
+AS_FORETOLD = 0.5  # a Newton step whose gain is what it foretells to within this part is followed by another
 
 
 class Ascent(NamedTuple):

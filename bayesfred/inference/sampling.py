@@ -37,7 +37,7 @@ Floats = npt.NDArray[np.float64]
 
 RHAT = 1.01
 FIRST_CHECK = 8  # steps; fewer say nothing about autocorrelation
-GROWTH = 1.2  # of the number of steps between checks
+GROWTH = 1.1  # of the number of steps between checks
 MOST_STEPS = 100_000
 CHECKPOINT = 30.0  # seconds from one to the next, or more:
 CHECKPOINT_SHARE = 0.01  # of a run's time goes into them
@@ -142,7 +142,7 @@ def burn_in(chain: Floats) -> int:
 
     Walkers start from the Laplace approximation, so what must be forgotten is its difference from the posterior. Were the slowest
     parameter's correlations r^k after k steps, its autocorrelation time would be tau = (1 + r)/(1 - r); the steps are those
-    after which a fiftieth is left, r^k = 1/50.
+    after which a twentieth is left, r^k = 1/20.
     """
     n_steps = chain.shape[1]
     kept = chain[:, n_steps // 4 :]
@@ -153,7 +153,7 @@ def burn_in(chain: Floats) -> int:
     if not effective > 0:
         return half
     tau = max(draws / effective, 1.1)
-    return min(half, math.ceil(math.log(50.0) / math.log((tau + 1.0) / (tau - 1.0))))
+    return min(half, math.ceil(math.log(20.0) / math.log((tau + 1.0) / (tau - 1.0))))
 
 
 def versions() -> dict[str, str]:
@@ -240,6 +240,9 @@ class _Run:
     def _enough(self, target_ess: float) -> tuple[bool, float]:
         """Whether the draws so far suffice, and which share of the effective draws wanted they are."""
         chain = np.stack([step.coords for step in self.steps], axis=1)
+        draws = chain[..., 0].size
+        if draws < target_ess:  # effective draws are not more than draws
+            return False, draws / target_ess
         rhat, bulk, tail = convergence(chain[:, burn_in(chain) :])
         share = float(min(bulk.min(), tail.min()) / target_ess)
         return bool(share >= 1.0 and rhat.max() <= RHAT), share
