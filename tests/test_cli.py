@@ -17,7 +17,7 @@ import textwrap
 import time
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -36,6 +36,7 @@ from bayesfred.cli import app
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.chainfile import Chain, open_chain
+from bayesfred.inference.estimate import find_map
 from bayesfred.inference.examine import seal
 from bayesfred.inference.posterior import Posterior
 from bayesfred.settings import RunSettings, read_settings
@@ -1008,3 +1009,28 @@ def test_real_frame(tmp_path: Path) -> None:
     assert output.code == 0
     assert "\nconverged: " in output.stdout
     check_page_and_picture(tmp_path / "chains", "startracker")
+    chain = open_chain(tmp_path / "chains" / "startracker.h5")
+    posterior = chain.posterior()
+    slopes = dipoles(posterior, chain.estimate.params)
+    # the root mean square of so many standard normal numbers has a Monte Carlo error of 1 / sqrt(2 n)
+    assert slopes.size > 100 and np.sqrt(np.mean(slopes**2)) < 1 + 4 / np.sqrt(2 * slopes.size)
+    # negative control: without it, every other star stands beside its place
+    fixed = replace(posterior.nuisances, position_scatter=False)
+    rigid = Posterior(posterior.model, posterior.counts, mask=posterior.mask, nuisances=fixed)
+    assert np.sqrt(np.mean(dipoles(rigid, find_map(rigid).params) ** 2)) > 1.5
+
+
+def dipoles(posterior: Posterior, params: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Residuals at every star projected on the model's slopes along v and u, in standard deviations."""
+    expected, sigma = posterior.expected_counts(params), posterior.sigma(params)
+    residual = (posterior.counts - expected) / sigma
+    sources, (ny, nx) = posterior.model.sources, expected.shape
+    found = []
+    for x, y in zip(sources.x + (nx - 1) / 2, sources.y + (ny - 1) / 2, strict=True):
+        if 5 <= x < nx - 5 and 5 <= y < ny - 5:
+            near = np.s_[round(y) - 4 : round(y) + 5, round(x) - 4 : round(x) + 5]
+            used = posterior.mask[near]
+            for slope in np.gradient(expected[near]):
+                part = (slope / sigma[near])[used]
+                found.append(part @ residual[near][used] / np.linalg.norm(part))
+    return np.array(found)
