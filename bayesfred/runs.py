@@ -299,9 +299,7 @@ def _report(
         )  # fmt: skip
     expected = posterior.expected_counts(chain.estimate.params)
     sigma = posterior.sigma(chain.estimate.params)
-    figure = plots.overview(
-        posterior.counts, expected, sigma, posterior.mask, chain.draws(), chain.parameter_names, truth=truth
-    )
+    figure = plots.overview(posterior.counts, expected, sigma, posterior.mask, chain.draws(), chain.parameter_names, truth=truth)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=150)
     files.write_bytes(picture, buffer.getvalue(), overwrite=True)

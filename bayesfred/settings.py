@@ -351,8 +351,6 @@ class RunSettings(_Section):
     simulation: SimulationSettings | None = None
 
 
-
-
 def read_settings(path: str | Path) -> RunSettings:
     """Read and check a run file.
 

@@ -82,6 +82,8 @@ def share(run: Callable[[], object]) -> float:
     total = time.perf_counter() - start
     sampling.write_chain = write
     return spent / total
+
+
 MEMORY = """
 import re, numpy as np, bayesfred as bf
 

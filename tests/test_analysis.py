@@ -30,9 +30,7 @@ def ar1(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Floats:
     return x
 
 
-def ensembles(
-    rng: np.random.Generator, n_steps: int, phi: float = 0.0, d: int = 1, n_walkers: int = 32
-) -> Floats:
+def ensembles(rng: np.random.Generator, n_steps: int, phi: float = 0.0, d: int = 1, n_walkers: int = 32) -> Floats:
     """A chain (4, n_steps, n_walkers, d) of independent AR(1) walkers."""
     return np.ascontiguousarray(ar1(rng, (4, n_walkers, d, n_steps), phi).transpose(0, 3, 1, 2))
 
@@ -224,11 +222,7 @@ def refits(flux: float, background: float, read_noise: float = 0.0, n: int = 300
     mu = flux * profile() + background
     out = []
     for _ in range(n):
-        counts = (
-            rng.poisson(mu) + rng.normal(0.0, read_noise, SHAPE)
-            if read_noise
-            else rng.poisson(mu).astype(float)
-        )
+        counts = rng.poisson(mu) + rng.normal(0.0, read_noise, SHAPE) if read_noise else rng.poisson(mu).astype(float)
         posterior = linear_posterior(counts, SimpleNamespace(read_noise=read_noise))
         params = most_likely(counts, (flux, background), read_noise)
         out.append(diagnose(chain_at(params, posterior), target_ess=100.0))
@@ -237,16 +231,9 @@ def refits(flux: float, background: float, read_noise: float = 0.0, n: int = 300
 
 @pytest.mark.parametrize(("flux", "background"), [(3000.0, 5.0), (400.0, 0.1)])
 @pytest.mark.parametrize("statistic", ["pearson", "deviance"])
-def test_statistics_of_fitted_frames_have_the_stated_mean_and_sd(
-    flux: float, background: float, statistic: str
-) -> None:
+def test_statistics_of_fitted_frames_have_the_stated_mean_and_sd(flux: float, background: float, statistic: str) -> None:
     results = refits(flux, background)
-    z = np.array(
-        [
-            (getattr(r, statistic) - getattr(r, f"{statistic}_expected")) / getattr(r, f"{statistic}_sd")
-            for r in results
-        ]
-    )
+    z = np.array([(getattr(r, statistic) - getattr(r, f"{statistic}_expected")) / getattr(r, f"{statistic}_sd") for r in results])
     error = 1.0 / np.sqrt(z.size)
     assert abs(z.mean()) < 4.0 * error
     assert abs(z.std() - 1.0) < 4.0 * error / np.sqrt(2.0)

@@ -789,7 +789,7 @@ def test_names_are_escaped_on_the_page(folder: Path) -> None:
     found = _Tags(page)
     assert "script" not in found.tags
     assert all(reference.startswith("data:image/png;base64,") for reference in found.references)
-    assert "onerror=\"" not in page
+    assert 'onerror="' not in page
     shown = page_text(folder / "run.html")
     assert f"{EVIL}.fits: 60 x 75 pixels" in shown
     assert f"{EVIL}.csv: 9 sources" in shown

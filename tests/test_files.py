@@ -63,9 +63,7 @@ def test_frame_keeps_every_bit(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_array_equal(read_frame(tmp_path / f"frame{suffix}", gain=1.0).counts, image)
 
 
-@pytest.mark.parametrize(
-    "dtype", [np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.int64, np.float32, ">f8"]
-)
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.int64, np.float32, ">f8"])
 @pytest.mark.parametrize("suffix", [".fits", ".h5", ".npy"])
 def test_stored_types(tmp_path: Path, dtype: Any, suffix: str) -> None:
     path, stored = tmp_path / f"frame{suffix}", COUNTS.astype(dtype)
@@ -277,9 +275,7 @@ def test_odd_headings_are_read_in_silence(tmp_path: Path) -> None:
     path = tmp_path / "frame.fits"
     write_frame(path, COUNTS)
     whole = path.read_bytes()
-    path.write_bytes(
-        whole.replace(b"EXTEND ", b"EXT\xe9ND ")[: 2880 + COUNTS.nbytes]
-    )  # and no padding at the end
+    path.write_bytes(whole.replace(b"EXTEND ", b"EXT\xe9ND ")[: 2880 + COUNTS.nbytes])  # and no padding at the end
     np.testing.assert_array_equal(read_frame(path).counts, COUNTS)
 
 

@@ -22,12 +22,12 @@ from test_inference import EVERYTHING, make_model, make_posterior, make_truth
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference import ensembles, examine
+from bayesfred.inference import ensembles, examine, sampling
 from bayesfred.inference.chainfile import Chain, fingerprint, open_chain, random_states, write_chain
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise
 from bayesfred.inference.posterior import Nuisances, Posterior
-from bayesfred.inference.sampling import sample
+from bayesfred.inference.sampling import burn_in, sample
 
 Floats = NDArray[np.float64]
 
@@ -535,3 +535,11 @@ def test_the_posterior_is_rebuilt(
     assert np.array_equal(again.gradient(truth), posterior.gradient(truth), equal_nan=True)
     assert (again.parameter_names, again.noise, again.nuisances) == (posterior.parameter_names, noise, nuisances)
     assert fingerprint(again) == fingerprint(posterior)
+
+
+@pytest.mark.parametrize("effective", [0.0, 1e-15, 1e-3])
+def test_walkers_that_hardly_move_leave_half_the_run_out(monkeypatch: pytest.MonkeyPatch, effective: float) -> None:
+    """However long the correlation is; 1/effective overflows no logarithm."""
+    sizes = np.full(2, effective)
+    monkeypatch.setattr(sampling, "convergence", lambda _: (sizes, sizes, sizes))
+    assert burn_in(np.zeros((4, 80, 8, 2))) == 40

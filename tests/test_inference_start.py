@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import spatial
+from scipy import optimize, spatial
 
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -11,7 +11,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference import start
+from bayesfred.inference import ascent, start
 from bayesfred.inference.ascent import climb
 from bayesfred.inference.estimate import find_map
 from bayesfred.inference.noise import simulate
@@ -270,3 +270,16 @@ def test_terms_that_differ_by_the_distortion_alone_are_not_refused() -> None:
     """u x and x^2 cannot be told apart where u is nearly x, and nothing depends on it."""
     model = grid(distortion=PolynomialDistortion.complete(3))
     assert find_map(Posterior(model, simulate(model, np.zeros(model.distortion.n_terms), 2.0, seed=11))).converged
+
+
+def test_a_search_that_ends_below_its_start_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = grid(7)
+    posterior = Posterior(model, simulate(model, np.zeros(4), 2.0, seed=3))
+    begin = posterior.start()
+    begin[0] += 5.0 / model.sources.x.max() ** 3
+    # the search is called at once, and returns a point at which the map folds
+    monkeypatch.setattr(ascent, "AS_FORETOLD", 0.0)
+    monkeypatch.setattr(ascent, "_search", lambda *_: optimize.OptimizeResult(x=np.full(5, 1e9), fun=1.0, nfev=1))
+    assert not np.isfinite(posterior.log_prob(begin + 1e9))
+    reached = climb(posterior, begin)
+    assert reached.log_prob > float(posterior.log_prob(begin)) and np.isfinite(reached.distance)

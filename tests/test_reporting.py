@@ -34,9 +34,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
     """A chain of independent draws around the truth and its posterior: the attributes the report reads."""
     rng = np.random.default_rng(1)
     distortion = PolynomialDistortion(((1, 0, 1, 0), (2, 0, 1, 0)), ((0, 1, 0, 1), (0, 2, 0, 1)))
-    model = ForwardModel(
-        Detector((61, 81)), SourceCatalog.grid(3, 20.0, 3000.0), GaussianPSF(2.5), distortion
-    )
+    model = ForwardModel(Detector((61, 81)), SourceCatalog.grid(3, 20.0, 3000.0), GaussianPSF(2.5), distortion)
     names = (*distortion.names, "background", *names_extra)
     counts = rng.poisson(model.expected_counts(TRUTH, BACKGROUND)).astype(float)
     centre = np.concatenate([TRUTH, [BACKGROUND], np.zeros(len(names_extra))])
@@ -135,9 +133,7 @@ def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
 
 
 def test_page_says_what_it_must(tmp_path: Path) -> None:
-    _, page = report(
-        tmp_path, truth=np.append(TRUTH, BACKGROUND), notes=["Seen at dusk."], settings='{"seed": 7}'
-    )
+    _, page = report(tmp_path, truth=np.append(TRUTH, BACKGROUND), notes=["Seen at dusk."], settings='{"seed": 7}')
     for words in ("converged: R-hat at most", "truth", "ESS bulk", "Pearson", "Deviance", "Seen at dusk.",
                   '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5"):  # fmt: skip
         assert words in page.text
@@ -208,9 +204,7 @@ def test_labels_carry_power_and_unit(name: str, label: str) -> None:
 def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:
     chain, _ = run()
     truth = np.append(TRUTH, BACKGROUND)
-    figure = plots.corner_plot(
-        chain.draws(), chain.parameter_names, truth=truth, estimate=chain.estimate.params
-    )
+    figure = plots.corner_plot(chain.draws(), chain.parameter_names, truth=truth, estimate=chain.estimate.params)
     assert len(figure.axes) == 25
     assert "10^{-6}" in figure.axes[-4].get_xlabel()
     assert "background" in figure.axes[-1].get_xlabel()
@@ -259,9 +253,7 @@ def test_triptych_axes_count_pixels_from_the_middle(shape: tuple[int, int]) -> N
     assert residual.images[0].get_clim() == (-5.0, 5.0)
     shown = values(residual)
     assert np.ma.count(shown) == mask.sum()
-    assert float(shown[ny // 4, nx // 4]) == pytest.approx(
-        float((counts - expected)[ny // 4, nx // 4] / 4000.0**0.5 / 2.0)
-    )
+    assert float(shown[ny // 4, nx // 4]) == pytest.approx(float((counts - expected)[ny // 4, nx // 4] / 4000.0**0.5 / 2.0))
     pixels(figure)
 
 

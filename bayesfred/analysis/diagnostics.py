@@ -175,8 +175,5 @@ def _verdict(
     if failures:
         return False, "not converged: " + "; ".join(failures)
     return True, (
-        f"converged: R-hat at most {rhat[worst]:.4f}, effective sample size at least {ess[least]:.0f}, "
-        f"acceptance {acceptance:.1%}"
+        f"converged: R-hat at most {rhat[worst]:.4f}, effective sample size at least {ess[least]:.0f}, acceptance {acceptance:.1%}"
     )
-
-

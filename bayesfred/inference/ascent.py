@@ -76,9 +76,10 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
             break
         result = _search(posterior, params, value, whiten)
         evaluations += result.nfev
-        if not (result.fun < 0.0 or gain > 0.0):
+        if result.fun < 0.0:
+            params, value = params + whiten @ result.x, value - result.fun
+        elif not gain > 0.0:
             break
-        params, value = params + whiten @ result.x, value - result.fun
     return Ascent(params, float(posterior.log_prob(params)), whiten @ whiten.T, distance, evaluations)
 
 

@@ -73,9 +73,7 @@ def deviance_moments(
     slope = mean / inside * spline(np.log(inside), 1)[..., 0]
     log_mu = np.log(mu)
     mean = np.where(small, -2.0 * mu * log_mu, np.where(large, 1.0 + (1.0 + 1.0 / mu) / (6.0 * mu), mean))
-    variance = np.where(
-        small, 4.0 * mu * (1.0 + log_mu) ** 2, np.where(large, 2.0 + 2.0 / (3.0 * mu), variance)
-    )
+    variance = np.where(small, 4.0 * mu * (1.0 + log_mu) ** 2, np.where(large, 2.0 + 2.0 / (3.0 * mu), variance))
     slope = np.where(small, -2.0 * (1.0 + log_mu), np.where(large, -1.0 / (6.0 * mu**2), slope))
     return mean, variance, slope
 

@@ -99,9 +99,7 @@ class Nuisances:
         if self.footprint is not None and not (np.isfinite(self.footprint) and self.footprint > 0):
             raise InputError(f"nuisances: footprint: got {self.footprint}, expected a radius in pixels > 0")
         if self.position_scatter and self.flux != "free":
-            raise InputError(
-                f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free ones: set flux to free"
-            )
+            raise InputError(f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free ones: set flux to free")
 
     @property
     def source_names(self) -> tuple[str, ...]:
@@ -319,9 +317,7 @@ class Posterior:
 
         def evaluate(first: int) -> None:
             with self._workspace() as w:
-                _kernels.log_likelihoods(
-                    self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out
-                )
+                _kernels.log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out)
 
         if threads == 1:
             evaluate(0)

@@ -150,7 +150,7 @@ def burn_in(chain: Floats) -> int:
     effective = float(min(bulk.min(), tail.min()))
     draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
     half: int = n_steps // 2
-    if not effective > 0:
+    if not effective * half > draws:  # tau is longer
         return half
     tau = max(draws / effective, 1.1)
     return min(half, math.ceil(math.log(20.0) / math.log((tau + 1.0) / (tau - 1.0))))

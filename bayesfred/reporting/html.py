@@ -171,9 +171,7 @@ def _statistic(name: str, value: float, expected: float, sd: float, meaning: str
     return _Statistic(name, f"{value:.1f}", f"{expected:.1f}", f"{sd:.1f}", _z(value - expected, sd), meaning)
 
 
-def _figures(
-    chain: Chain, posterior: Posterior, draws: Floats, truth: Floats | None
-) -> list[tuple[str, str, str]]:
+def _figures(chain: Chain, posterior: Posterior, draws: Floats, truth: Floats | None) -> list[tuple[str, str, str]]:
     """Heading, caption and data URI of each figure."""
     counts, mask = posterior.counts, posterior.mask
     expected = posterior.expected_counts(chain.estimate.params)
@@ -193,9 +191,7 @@ def _figures(
         (
             "Posterior",
             "Contours hold 39 % and 86 % of the draws.",
-            _data_uri(
-                plots.corner_plot(draws, chain.parameter_names, truth=truth, estimate=chain.estimate.params)
-            ),
+            _data_uri(plots.corner_plot(draws, chain.parameter_names, truth=truth, estimate=chain.estimate.params)),
         ),
         (
             "Chain",

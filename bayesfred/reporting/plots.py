@@ -204,9 +204,7 @@ def trace_plot(chain: Chain) -> Figure:
     # the third column keeps a distance
     axes = fig.subplots(rows, 5, squeeze=False, width_ratios=(4, 1, 0.65, 4, 1))
     height = fig.get_figheight()
-    fig.subplots_adjust(
-        left=0.07, right=0.99, bottom=0.5 / height, top=1 - 0.4 / height, wspace=0.06, hspace=0.2
-    )
+    fig.subplots_adjust(left=0.07, right=0.99, bottom=0.5 / height, top=1 - 0.4 / height, wspace=0.06, hspace=0.2)
     steps = np.unique(np.linspace(0, n_steps - 1, min(n_steps, MAX_TRACE_STEPS)).astype(int))
     for k, name in enumerate(chain.parameter_names):
         # down the first pair of columns, then down the second, as the table of parameters runs
@@ -257,9 +255,7 @@ def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) 
     return fig
 
 
-def star_panels(
-    counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: Floats, v: Floats, *, half_width: int
-) -> Figure:
+def star_panels(counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: Floats, v: Floats, *, half_width: int) -> Figure:
     """Cut-outs around the brightest sources: counts, model and residual side by side.
 
     Counts and model of a source share a scale; all residuals share one, so that a misplaced source shows as a
@@ -282,9 +278,7 @@ def star_panels(
     """
     ny, nx = counts.shape
     # a source without an image has the position nan, far outside for what follows
-    column, row = (
-        np.rint(np.nan_to_num(place, nan=-1e9) + (n - 1) / 2).astype(int) for place, n in ((u, nx), (v, ny))
-    )
+    column, row = (np.rint(np.nan_to_num(place, nan=-1e9) + (n - 1) / 2).astype(int) for place, n in ((u, nx), (v, ny)))
     inside = np.flatnonzero((column >= 0) & (column < nx) & (row >= 0) & (row < ny))
     stamp = partial(_stamp, half_width=half_width)
     light = [float(np.nansum(stamp(expected, column[s], row[s]))) for s in inside]
@@ -297,9 +291,7 @@ def star_panels(
         return fig
     used, residual = _recorded(counts, mask), _residual(counts, expected, sigma, mask)
     width, height = fig.get_size_inches()
-    outer = fig.add_gridspec(
-        1, blocks, left=0.01, right=1 - 0.75 / width, bottom=0.01, top=1 - 0.42 / height, wspace=0.06
-    )
+    outer = fig.add_gridspec(1, blocks, left=0.01, right=1 - 0.75 / width, bottom=0.01, top=1 - 0.42 / height, wspace=0.06)
     for b in range(blocks):
         grid = outer[b].subgridspec(rows, 3, wspace=0.03, hspace=0.06)
         for r, s in enumerate(shown[b * rows : (b + 1) * rows]):
@@ -384,9 +376,7 @@ def overview(
     return fig
 
 
-def _draw_triptych(
-    fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask
-) -> None:
+def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> None:
     """Frame, model and residual on three axes; the first two share a colour bar."""
     ny, nx = counts.shape
     extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
