@@ -141,7 +141,7 @@ def find_peaks(posterior: Posterior) -> Floats:
     detector = posterior.model.detector
     step = detector.binning
     width = np.hypot(posterior.model.psf.sigma / step, 12.0**-0.5)
-    block = max(1, int(width / 1.5))
+    block = max(1, min(int(width / 1.5), min(detector.shape) // 3))
     s = max(np.sqrt(width**2 + (block**2 - 1) / 12.0) / block, 1.0)
     ny, nx = (n // block for n in detector.shape)
 
