@@ -459,8 +459,8 @@ class Posterior:
         try:
             workspace = self._workspaces.get_nowait()
         except queue.Empty:
-            ny, nx = self.model.detector.shape
-            workspace = _kernels.new_workspace(ny, stride(nx))
+            typical = self._arguments(self.start()[None])[1][0]
+            workspace = _kernels.new_workspace(self._optics, typical, self._free)
         yield workspace
         self._workspaces.put(workspace)
 
