@@ -140,7 +140,7 @@ class PSFSettings(_Section):
     fwhm: _Positive | None = None
     beta: Annotated[float, Field(gt=1, le=100)] | None = None
     path: _Name | None = None
-    oversampling: Annotated[float, Field(ge=1, le=_LARGEST)] | None = None
+    oversampling: Annotated[float, Field(ge=1, le=1001)] | None = None
 
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> PSFSettings:

@@ -852,7 +852,8 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
     P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u.
 
     Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is shifted along a and along b,
-    X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or by -p_b.
+    X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or by -p_b. The number comes as an np.int64: of a literal one
+    this function would be compiled anew.
     """
     ra, rb, rav, rbv, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5]
     ramp, conserve = o.ramp, len(o.d_degree) > 0
@@ -917,7 +918,7 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
             j, low, n = fp.row[p], fp.low[p], fp.size[p]
             if not first <= j < last:
                 continue
-            basis_row(o, maps, basis, s, j, low, n, sigma, 0, rows, samples, powers, work)
+            basis_row(o, maps, basis, s, j, low, n, sigma, np.int64(0), rows, samples, powers, work)
             for k in range(basis.row.size):
                 c = flux[s] * basis.lever[s, k]
                 if c != 0.0:

@@ -194,7 +194,7 @@ class SampledPSF:
     values : array_like, shape (n, n), any unit
         Samples [b, a] on a square grid, n odd, the PSF's middle in the middle.
     oversampling : float
-        Samples per pixel, >= 1.
+        Samples per pixel.
 
     Attributes
     ----------
@@ -205,7 +205,7 @@ class SampledPSF:
     ------
     InputError
         If the samples are not finite, their sum is not positive, or n is even, less than 3 or more than 1001; if `oversampling`
-        is less than 1.
+        is less than 1 or more than 1001.
 
     References
     ----------
@@ -237,10 +237,12 @@ class SampledPSF:
             raise InputError(
                 f"psf: values: got {np.sum(~np.isfinite(values))} that are not finite, expected numbers: fill them first"
             )
-        if not (math.isfinite(self.oversampling) and self.oversampling >= 1.0):
-            raise InputError(f"psf: oversampling: got {self.oversampling}, expected samples per pixel, at least 1")
-        if not 0.0 < values.sum() < math.inf or not 0.0 < _coefficients(values).sum() < math.inf:
-            raise InputError(f"psf: values: got a sum of {values.sum():.4g}, expected a positive one: subtract less background")
+        if not 1.0 <= self.oversampling <= MOST_SAMPLES:
+            raise InputError(f"psf: oversampling: got {self.oversampling}, expected samples per pixel, 1 to {MOST_SAMPLES}")
+        with np.errstate(over="ignore", invalid="ignore"):
+            total, scale = float(values.sum()), float(_coefficients(values).sum())
+        if not (0.0 < total < math.inf and 0.0 < scale < math.inf):
+            raise InputError(f"psf: values: got a sum of {total:.4g}, expected a positive one: subtract less background")
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "oversampling", float(self.oversampling))
@@ -329,7 +331,7 @@ class SampledPSF:
     def sigma(self) -> float:
         """Width of the Gaussian that exceeds half its peak in as large an area, pixel."""
         n = len(self.values)
-        fine = max(1, MOST_SAMPLES // n) * n  # cells a side
+        fine = (MOST_SAMPLES // n | 1) * n  # cells a side, one about every sample
         x = (np.arange(fine) - 0.5 * (fine - 1)) * n / (fine * self.oversampling)
         share = np.mean(self.density(x, x[:, None]) >= 0.5 * self.peak)
         return float(n / self.oversampling * math.sqrt(share / (2.0 * math.pi * math.log(2.0))))
@@ -360,9 +362,9 @@ class SampledPSF:
 
     def density(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Floats:
         """The PSF at (a, b), pixel from its middle; per square pixel."""
-        middle = 0.5 * (len(self._spline) - 1)
-        at = [np.multiply(x, self.oversampling) + middle for x in np.broadcast_arrays(b, a)]
-        return np.asarray(self.oversampling**2 * ndimage.map_coordinates(self._spline, at, prefilter=False))
+        at = np.stack(np.broadcast_arrays(b, a)) * self.oversampling + 0.5 * (len(self._spline) - 1)
+        values = ndimage.map_coordinates(self._spline, at.reshape(2, -1), prefilter=False)
+        return np.asarray(self.oversampling**2 * values.reshape(at.shape[1:]))
 
     def write(self, group: Any) -> None:
         """Store the PSF in an HDF5 group."""

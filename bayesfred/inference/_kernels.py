@@ -758,9 +758,9 @@ def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, g):
     xx, xy, yy = np.empty(pitch), np.empty(pitch), np.empty(pitch)
     for p in range(fp.first[s], fp.first[s + 1]):
         j, low, n = fp.row[p], fp.low[p], fp.size[p]
-        basis_row(o, drawn.maps, constants, s, j, low, n, sigma, 1, rows.out, rows.samples, rows.powers, rows.work)
+        basis_row(o, drawn.maps, constants, s, j, low, n, sigma, np.int64(1), rows.out, rows.samples, rows.powers, rows.work)
         xx[:n], xy[:n] = -flux * rows.out[0, :n], -flux * rows.out[1, :n]
-        basis_row(o, drawn.maps, constants, s, j, low, n, sigma, 2, rows.out, rows.samples, rows.powers, rows.work)
+        basis_row(o, drawn.maps, constants, s, j, low, n, sigma, np.int64(2), rows.out, rows.samples, rows.powers, rows.work)
         yy[:n] = -flux * rows.out[1, :n]
         for k in range(n):
             at, pixel = fp.start[p] + k, j * pitch + low + k
