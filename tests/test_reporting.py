@@ -138,7 +138,8 @@ def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
 def test_page_says_what_it_must(tmp_path: Path) -> None:
     _, page = report(tmp_path, truth=np.append(TRUTH, BACKGROUND), notes=["Seen at dusk."], settings='{"seed": 7}')
     for words in ("converged: R-hat at most", "truth", "ESS bulk", "Pearson", "Deviance", "Seen at dusk.",
-                  '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5", "Prior-dominated: none."):  # fmt: skip
+                  '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5",
+                  "Prior-dominated: none."):  # fmt: skip
         assert words in page.text
     # uncertainty to two digits, value to the same place, in one power of ten
     assert re.search(r"10−6 px−1\s+3\.00\s+3\.00\s+(3\.0\d|2\.9\d)\s+0\.12\s", page.text)
