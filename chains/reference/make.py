@@ -38,9 +38,9 @@ def posterior(name: str, **model: Any) -> bf.Posterior:
     return assembly.posterior_given(changed, assembly.forward_model(changed, shape, sources), made.counts, None)
 
 
-def counts_hash(posterior: bf.Posterior) -> str:
+def counts_hash(counts: Floats) -> str:
     """SHA-256 of the counts as 64-bit little-endian integers, row by row."""
-    return hashlib.sha256(posterior.counts.astype("<i8").tobytes()).hexdigest()
+    return hashlib.sha256(counts.astype("<i8").tobytes()).hexdigest()
 
 
 def error(values: Floats) -> Floats:
@@ -72,7 +72,7 @@ def record(name: str, chain: bf.Chain) -> str:
     _, bulk, tail = convergence(chain.chain[:, chain.burn_in :])
     head = {
         "run_file": f"{name}.toml",
-        "counts_sha256": counts_hash(chain.posterior()),
+        "counts_sha256": counts_hash(chain.posterior().counts),
         "sampling_seed": chain.seed,
         "versions": chain.versions,
         "n_draws": len(draws),
