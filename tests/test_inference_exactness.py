@@ -268,7 +268,7 @@ def test_a_conjugate_posterior_is_sampled(tmp_path: Path, precision: float, wron
 
 # --- the whole loop -----------------------------------------------------------------------------------------
 
-CHAINS, ROUNDS = 80, 25
+CHAINS, ROUNDS = 100, 40
 FLUX = 20.0  # photons a source: the posterior is two thirds as wide as the prior
 SMALL = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
 PRIOR = {

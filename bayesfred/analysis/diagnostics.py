@@ -33,7 +33,7 @@ MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
 FEWEST = 100  # draws from which a sensitivity is read
 FLAT = 1e-6  # difference of log densities that moves no posterior
-INFORMATIVE = 0.05  # sensitivity: Kallioinen et al., section 2.5
+INFORMATIVE = 0.05  # sensitivity; the threshold of Kallioinen et al., and of arviz
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def summary(chain: bf.Chain) -> dict[str, dict[str, Any]]:
         low, high = (np.array([np.quantile(x, q) for x, q in zip(draws.T, p + s * share, strict=True)]) for s in (-1, 1))
         numbers[f"{p:.0%}"] = value, 0.5 * (high - low)
     return {
-        name: {what: {"value": value[k], "error": error[k]} for what, (value, error) in numbers.items()}
+        name: {what: {"value": value[k], "error": its_error[k]} for what, (value, its_error) in numbers.items()}
         for k, name in enumerate(chain.parameter_names)
     }
 
