@@ -331,6 +331,12 @@ class Posterior:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
         return self._log_prior(self._vectors(params))
 
+    @cached_property
+    def support(self) -> tuple[Floats, Floats]:
+        """The least and the largest value that the prior admits of every parameter, shape (d,) each."""
+        low, high = np.array([distribution.support() for distribution in self.prior.values()]).T
+        return low, high
+
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
         vector = self._vectors(params)[0]

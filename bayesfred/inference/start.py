@@ -98,8 +98,10 @@ def find_start(posterior: Posterior) -> Start:
     field = Field(posterior)
     plain = posterior.start()
     plain[field.columns] = field.centre
+    plain = np.clip(plain, *posterior.support)
     params = plain.copy()
     params[field.columns] = z
+    params = np.clip(params, *posterior.support)
     params = _unfolded(posterior, params, plain)
     if not np.isfinite(posterior.log_prob(params)):
         return Start(plain, "the prior's medians", matched)
