@@ -86,17 +86,17 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
         means = np.atleast_2d(mean)
         d = means.shape[1]
-        covariances = np.reshape(covariance, (-1, d, d))
         low, high = (np.broadcast_to(bound, d) for bound in support)
-        reach = NEAR * np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
-        near = np.any((means - low < reach) | (high - means < reach), axis=0)
-        self.order = np.argsort(~near, kind="stable")  # parameters near a bound first
-        self.bounds = np.stack([low, high], axis=1)[near]
-        self.means = means[:, self.order]
         try:
+            covariances = np.reshape(covariance, (-1, d, d))
+            reach = NEAR * np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
+            near = np.any((means - low < reach) | (high - means < reach), axis=0)
+            self.order = np.argsort(~near, kind="stable")  # parameters near a bound first
             self.lowers = np.array([cholesky(c[np.ix_(self.order, self.order)], lower=True) for c in covariances])
         except (LinAlgError, ValueError):
             raise InputError("estimate: got no positive definite covariance, expected the maximum's: see find_map") from None
+        self.bounds = np.stack([low, high], axis=1)[near]
+        self.means = means[:, self.order]
         self.weights = np.asarray(weights, dtype=np.float64)
 
     @classmethod
