@@ -1,5 +1,7 @@
 """Starts from counts alone: peaks, matching outward, growing disks; and what `find_map` says about where it ended."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +16,7 @@ from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference import ascent, start
 from bayesfred.inference.ascent import climb
 from bayesfred.inference.estimate import find_map
-from bayesfred.inference.noise import simulate
+from bayesfred.inference.noise import BackgroundNoise, simulate
 from bayesfred.inference.posterior import Nuisances, Posterior
 from bayesfred.inference.start import Field, find_peaks, find_start, match, outward
 
@@ -143,6 +145,22 @@ def test_an_unknown_pointing_is_found_on_a_grid() -> None:
     assert np.abs((best.params - [*truth, 2.0, 12.0, -7.0]) / np.sqrt(np.diag(best.covariance))).max() < 5.0
 
 
+def test_blends_of_unequal_stars_with_some_missing_and_some_spurious() -> None:
+    rng = np.random.default_rng(12)
+    x, y = rng.uniform(-80.0, 80.0, (2, 80))
+    flux = 5e3 * rng.lognormal(0.0, 1.0, 80)
+    here = rng.random(80) > 0.1
+    model = ForwardModel(Detector((221, 221)), SourceCatalog(x, y, flux), GaussianPSF(2.0), PINHOLE)
+    spots = SourceCatalog(np.append(x[here], rng.uniform(-80, 80, 8)), np.append(y[here], rng.uniform(-80, 80, 8)),
+                          np.append(flux[here], rng.choice(flux, 8)))  # fmt: skip
+    frame = simulate(ForwardModel(model.detector, spots, model.psf, PINHOLE), bent(model, 20.0), 2.0, seed=12)
+    posterior = Posterior(model, frame)
+    assert 0.2 < np.mean(Field(posterior).alone) < 0.9
+    assert distance(posterior, np.append(bent(model, 20.0), 2.0)) < 0.01
+    best = find_map(posterior)
+    assert best.at_maximum and not best.converged and "sources that the catalogue lacks or the frame misses" in best.message
+
+
 # --- peaks ------------------------------------------------------------------------------------------------
 
 
@@ -193,6 +211,19 @@ def test_no_start_folds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert start.find_start(posterior).path == "the prior's medians"
 
 
+@pytest.mark.parametrize("conserve_flux", [True, False])
+def test_a_second_image_in_the_frame_is_outside_the_prior(conserve_flux: bool) -> None:
+    """u - x + c x u^2 = 0 has a second root, where D < 0, at u = -46 for x = 40 and c = 1e-3, and at -285 for c = 1e-4."""
+    distortion = PolynomialDistortion([(1, 0, 2, 0)], [])
+    for x, half, c, folds in [(40.0, 60, 1e-3, True), (40.0, 60, 1e-4, False), (40.0, 300, 1e-4, True), (40.0, 200, 1e-4, False)]:
+        detector = Detector((61, 2 * half + 1))
+        model = ForwardModel(detector, SourceCatalog([x], [0.0], [1e4]), GaussianPSF(2.0), distortion, conserve_flux=conserve_flux)
+        u, v = distortion.image_position([c], x, 0.0)
+        assert distortion.determinant([c], u, v, x, 0.0) > 0.0  # the star itself is imaged, and not mirrored
+        posterior = Posterior(model, np.ones(detector.shape))
+        assert np.isfinite(posterior.log_prob([c, 1.0])) != folds
+
+
 def test_spots_that_are_no_images_of_the_catalogue_give_starts_with_density() -> None:
     rng = np.random.default_rng(7)
     model = grid(side=5, distortion=MIRRORED)
@@ -241,6 +272,23 @@ def test_logarithmic_distortion_is_followed() -> None:
     best = find_map(posterior)
     assert best.at_maximum and "81 of 81 sources" in best.message
     assert np.hypot(*(images(posterior.model, best.params[:12]) - np.stack([u, v], axis=1)).T).max() < 1.0
+
+
+FIGURE_2C = [("mirrored", MIRRORED), pytest.param("complete(4)", PolynomialDistortion.complete(4), marks=pytest.mark.long)]
+
+
+@pytest.mark.parametrize(("name", "distortion"), FIGURE_2C)
+def test_the_papers_logarithmic_frame_is_fitted(
+    name: str, distortion: PolynomialDistortion, record_property: Callable[[str, object], None]
+) -> None:
+    """Fig. 2c: corner stars move by 60 pixels, spacing 50. The paper's V, of frames of unit flux, is 2.8e-3."""
+    detector, sources, psf = Detector((505, 505)), SourceCatalog.grid(9, 50.0, 1e5), GaussianPSF(10.0)
+    frame = ForwardModel(detector, sources, psf, LogDistortion(1e-5), conserve_flux=False).expected_counts([], 5.0)
+    posterior = Posterior(ForwardModel(detector, sources, psf, distortion, conserve_flux=False), frame, noise=BackgroundNoise())
+    best = find_map(posterior)
+    v = float(np.sum((frame - posterior.expected_counts(best.params)) ** 2) / 1e10)
+    record_property(f"V of {name}, beside the paper's 2.8e-3", v)
+    assert best.at_maximum and v < 2.8e-3
 
 
 # --- the verdict ------------------------------------------------------------------------------------------

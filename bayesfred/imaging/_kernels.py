@@ -277,61 +277,111 @@ def _multiply(a, b, conserve, q, d):
 
 
 @inner(cache=True)
-def _reach(o, a, b, radius, bounds):
-    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius; inf: the frame.
+def _reach(o, a, b, u, v, radius, bounds, stack):
+    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius, -1 if D <= 0 on one of them.
 
     With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2 of
     |c_mn| |d|^(m + n). On the ellipse |J d| = R' one has |d| <= R'/s, s the smaller singular value of J, hence
-    |(a, b)| >= R' - rho(R'/s) >= R as soon as R' >= R + rho(R'/s). The set |(a, b)| <= R around the peak is
-    connected where the map does not fold, so it lies inside. The smallest such R' is a fixed point. A pixel is
-    visited if its centre is within the ellipse enlarged by its farthest quadrature node.
+    |(a, b)| >= R' - rho(R'/s) >= R as soon as R' >= R + rho(R'/s). The smallest such R' is a fixed point. What lies
+    farther, up to the frame's farthest corner, is beyond R too if that corner is, for s |d| - rho(|d|) is concave.
+    Otherwise the frame is surveyed. A pixel is visited if its centre is within the ellipse enlarged by its farthest
+    quadrature node.
     """
     j11, j12, j21, j22 = a[1, 0], a[0, 1], b[1, 0], b[0, 1]
     half = 0.5 * (j11 * j11 + j12 * j12 + j21 * j21 + j22 * j22)
     det = j11 * j22 - j12 * j21
     root = math.sqrt(max(half * half - det * det, 0.0))
     largest = math.sqrt(half + root)
-    smallest = abs(det) / largest if largest > 0.0 else 0.0
-    if not (smallest > 0.0 and radius < math.inf):
+    smallest = det / largest
+    if not radius < math.inf:
         return math.inf
     bounds[:] = 0.0  # rho's coefficients
     for m in range(a.shape[0]):
         for n in range(a.shape[1]):
             bounds[m + n] += math.sqrt(a[m, n] * a[m, n] + b[m, n] * b[m, n])
-    reach = radius
-    for _ in range(60):
-        d = reach / smallest
-        rest = 0.0
+    margin = largest * math.sqrt(2.0) * abs(o.offsets[0])
+    farthest = math.hypot(abs(u) + 0.5 * o.nx * o.step, abs(v) + 0.5 * o.ny * o.step)
+    if smallest * farthest - _rest(bounds, farthest) > radius:
+        reach = radius
+        for _ in range(60):
+            rest = _rest(bounds, reach / smallest)
+            if radius + rest <= reach * (1.0 + 1e-6):
+                return reach * (1.0 + 1e-6) + margin
+            reach = radius + rest
+            if reach > 4.0 * radius:
+                break
+    reach = _survey(o, a, b, u, v, radius, bounds, stack)
+    return reach + margin if reach >= 0.0 else -1.0
+
+
+@inner(cache=True)
+def _rest(bounds, d):
+    """rho at distance d."""
+    rest = 0.0
+    for k in range(bounds.size - 1, 1, -1):
+        rest = (rest + bounds[k]) * d
+    return rest * d
+
+
+@inner(cache=True)
+def _survey(o, a, b, u, v, radius, bounds, stack):
+    """The largest |J d| in the frame where |(a, b)| <= radius, at most; -1 if D <= 0 there.
+
+    The frame is halved along both axes and so are its parts, unless they lie beyond the radius: at distance r from
+    a part's middle (a, b) differs from its value there by at most |J| r + M r^2 / 2, M = sum of |c_mn| k (k - 1) |d|^(k - 2),
+    k = m + n. Parts are not halved below a twelfth of the radius; there the middle stands for the part.
+    """
+    across, along = 0.5 * o.nx * o.step, 0.5 * o.ny * o.step
+    stack[0, 0], stack[0, 1], stack[0, 2] = -u, -v, 1.0
+    size, reach = 1, 0.0
+    while size > 0:
+        size -= 1
+        t, w, part = stack[size, 0], stack[size, 1], stack[size, 2]
+        half_t, half_w = part * across, part * along
+        r = math.hypot(half_t, half_w)
+        a_0, a_u, a_v = _evaluate(a, t, w, o.degree)
+        b_0, b_u, b_v = _evaluate(b, t, w, o.degree)
+        here = math.hypot(a_0, b_0)
+        far = math.hypot(t, w) + r
+        bend = 0.0
         for k in range(bounds.size - 1, 1, -1):
-            rest = (rest + bounds[k]) * d
-        rest *= d
-        if radius + rest <= reach * (1.0 + 1e-6):
-            return reach * (1.0 + 1e-6) + largest * math.sqrt(2.0) * abs(o.offsets[0])
-        reach = radius + rest
-        if reach > 4.0 * radius:
-            break
-    return math.inf
+            bend = bend * far + k * (k - 1) * bounds[k]
+        if here > radius + r * (math.sqrt(a_u * a_u + a_v * a_v + b_u * b_u + b_v * b_v) + 0.5 * bend * r):
+            continue
+        if max(half_t, half_w) <= radius / 12.0:
+            if here <= radius and a_u * b_v - a_v * b_u <= 0.0:
+                return -1.0
+            for i in range(4):
+                t_i, w_i = t + (half_t if i % 2 else -half_t), w + (half_w if i < 2 else -half_w)
+                reach = max(reach, math.hypot(a[1, 0] * t_i + a[0, 1] * w_i, b[1, 0] * t_i + b[0, 1] * w_i))
+            continue
+        for i in range(4):
+            stack[size, 0] = t + (0.5 * half_t if i % 2 else -0.5 * half_t)
+            stack[size, 1] = w + (0.5 * half_w if i < 2 else -0.5 * half_w)
+            stack[size, 2] = 0.5 * part
+            size += 1
+    return reach
 
 
 @inner(cache=True)
 def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
-    """Fill `maps`; False where a source has no image or a folded one (D <= 0 at its peak).
+    """Fill `maps`; False where a source has no image, or is seen where D <= 0: the map folds.
 
     Windows hold the pixels above the tolerance, and those above it once a source moves by up to `margin` in (a, b).
     """
     unfolded = True
     radius = sigma * o.reach + margin
-    bounds = np.empty(2 * len(o.degree) + 1)
+    bounds, stack = np.empty(2 * len(o.degree) + 1), np.empty((256, 3))
     for s in range(o.x.size):
         a = maps.a[s]
         b = maps.b[s]
         u, v, ok = _find_peak(o, s, theta, offset_x, offset_y, a, b)
-        unfolded = unfolded and ok
+        reach = _reach(o, a, b, u, v, radius, bounds, stack) if ok else math.inf
+        unfolded = unfolded and ok and reach >= 0.0
         _multiply(a, b, len(o.d_degree) > 0, maps.q[s], maps.d[s])
         maps.peak[s, 0] = u
         maps.peak[s, 1] = v
-        reach = _reach(o, a, b, radius, bounds) if ok else math.inf
-        if reach < math.inf:
+        if 0.0 <= reach < math.inf:
             alpha = a[1, 0] ** 2 + b[1, 0] ** 2
             maps.ellipse[s, 0] = alpha
             maps.ellipse[s, 1] = a[1, 0] * a[0, 1] + b[1, 0] * b[0, 1]

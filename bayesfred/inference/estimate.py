@@ -124,7 +124,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     ----------
     posterior : Posterior
     start : array_like, shape (d,), optional
-        Where to begin; by default without distortion, see `Posterior.start`.
+        Where to begin; by default what the counts alone say: peaks matched to the catalogue, see `start.py`.
 
     Returns
     -------
