@@ -98,7 +98,7 @@ def main() -> int:
         path = Path(folder) / "chain.h5"
         chain = split.run("emcee, proposals, rest", bf.sample, posterior, top, path=path, seed=1, progress=False)
         size = path.stat().st_size / 2**20
-    verdict, memory = bf.diagnose(chain), peak()
+        verdict, memory = bf.diagnose(chain), peak()
     share = kernel_share(posterior, top.params)
     whole = sum(split.spent.values())
     table = Table(title=f"{posterior.n_parameters} parameters, 10,000 sources on 4096 x 4096 pixels; {verdict.message}")
