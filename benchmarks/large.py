@@ -98,10 +98,10 @@ def main() -> int:
         path = Path(folder) / "chain.h5"
         chain = split.run("emcee, proposals, rest", bf.sample, posterior, top, path=path, seed=1, progress=False)
         size = path.stat().st_size / 2**20
-    verdict, memory = bf.diagnose(chain), peak()
+        verdict, memory = bf.diagnose(chain), peak()
     share = kernel_share(posterior, top.params)
     whole = sum(split.spent.values())
-    table = Table(title=f"{posterior.n_parameters} parameters, 10,000 sources on 4096 x 4096 pixels; {verdict.message}")
+    table = Table(title=f"{posterior.n_parameters} parameters, 10,000 sources")
     for head in ("", "seconds", "share"):
         table.add_column(head, justify="right" if head else "left")
     table.add_row("to the maximum", f"{to_map:.1f}")
@@ -112,6 +112,7 @@ def main() -> int:
             table.add_row("  of these the kernel", f"{share * spent:.1f}", f"{share * spent / whole:.0%}")
     console = Console(width=None if sys.stdout.isatty() else 110)
     console.print(table)
+    console.print(verdict.message)
     console.print(
         f"peak memory {memory:.1f} GiB of {MEMORY:.0f}, frame {posterior.counts.nbytes / 2**30:.2f}; chain file {size:.0f} MiB"
     )

@@ -147,7 +147,7 @@ def test_a_cut_posterior_is_sampled(easy: Posterior, estimate: MapEstimate, at: 
 # --- proposals that do not fit ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scale", [1 / 25, 25.0])
+@pytest.mark.parametrize("scale", [pytest.param(1 / 25, marks=pytest.mark.statistics), 25.0])
 def test_a_wrong_covariance_is_noticed_and_mended(easy: Posterior, estimate: MapEstimate, scale: float, tmp_path: Path) -> None:
     wrong = replace(estimate, covariance=scale * estimate.covariance)
     chain = run(easy, wrong, tmp_path / "chain.h5", target_ess=1000)
