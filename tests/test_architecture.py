@@ -429,7 +429,7 @@ def test_public_names_are_documented(name: str) -> None:
     assert undocumented(SOURCES[defined_in(name)], name) == []
 
 
-@pytest.mark.parametrize("name", ["demo", "fit", "report", "simulate_frame", "verify"])
+@pytest.mark.parametrize("name", ["demo", "fit", "report", "simulate_frame", "study", "verify"])
 def test_runs_are_documented(name: str) -> None:
     assert undocumented(SOURCES["bayesfred.runs"], name) == []
 
@@ -552,7 +552,8 @@ LONG = {
     "bayesfred.inference.posterior": "one class, whose methods share the frame as the loops read it",
     "bayesfred.settings": "one record a section, most of it what the fields mean",
     "bayesfred.files": "three formats of frames and two of catalogues, most of it what damaged files get wrong",
-    "bayesfred.reporting.plots": "seven independent figures with one style",
+    "bayesfred.reporting.plots": "nine independent figures with one style",
+    "bayesfred.runs": "one function a command, and what they share",
 }
 
 

@@ -28,6 +28,7 @@ Floats = npt.NDArray[np.float64]
 __all__ = ["NoiseStudy", "noise_study"]
 
 VARIABLES = ("background", "flux", "sources", "psf_sigma", "exposure")
+MOST_CELLS = 10_000
 ESS = 1000  # effective draws of every posterior
 
 
@@ -246,11 +247,16 @@ def noise_study(
     }
     for name, values in given.items():
         for value in values:
-            if not (math.isfinite(value) and value >= 0 and (value > 0 or name == "background")):
+            if not (math.isfinite(value) and value > 0):
                 raise InputError(f"noise study: {name}: got {value}, expected a number > 0")
     wrong = [n for n in given["sources"] if n != round(n) or n > len(model.sources)]
     if wrong:
         raise InputError(f"noise study: sources: got {wrong[0]}, expected a number from 1 to the catalogue's {len(model.sources)}")
+    number = math.prod(map(len, given.values()))
+    if number > MOST_CELLS:
+        raise InputError(
+            f"noise study: got {number} combinations of noise levels, expected at most {MOST_CELLS}: shorten the lists"
+        )
     cells = tuple(dict(zip(VARIABLES, map(float, cell), strict=True)) for cell in itertools.product(*given.values()))
     true = tuple(np.asarray(theta, dtype=np.float64).ravel().tolist())
     used = None if mask is None else np.array(mask, dtype=bool)
@@ -288,7 +294,7 @@ def _cells(study: _Levels, rows: Mapping[str, npt.NDArray[Any]]) -> dict[str, np
         n = int(mine.sum())
         head: dict[str, Any] = {**variables, "frames": n, "failed": int(((cell == j) & ~good).sum())}
         for key in ("chi2", "lambda"):
-            head[key], head[f"{key}_error"] = _mean(rows[key][mine])
+            head[key], head[f"{key}_error"] = _mean(rows[key][mine][np.isfinite(rows[key][mine])])  # chi2 needs lambda > 0
         unknown = dict.fromkeys(("truth", "width", "bias", "bias_error", "scatter", "bound"), math.nan)
         efficiency = d / _mean(rows["theta.distance"][mine])[0]
         every = np.stack([rows[f"{term}.pit"][mine] for term in names[:d]], axis=1)
