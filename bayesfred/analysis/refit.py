@@ -50,7 +50,8 @@ def draws(posterior: Posterior, estimate: MapEstimate, method: Method, seed: np.
     Of a chain that is long enough for so many effective draws those are kept that lie an autocorrelation time apart.
     """
     if method == "laplace":
-        return np.random.default_rng(seed).multivariate_normal(estimate.params, estimate.covariance, ess, method="cholesky")
+        normal = np.random.default_rng(seed).multivariate_normal(estimate.params, estimate.covariance, ess, method="cholesky")
+        return np.asarray(normal[np.isfinite(posterior.log_prob(normal))])  # those that the prior admits
     walkers = max(WALKERS, 2 * (posterior.n_parameters + 1))
     start = begin(posterior, estimate, int(seed.generate_state(1, np.uint64)[0]), 1, walkers)
     check_start(posterior.parameter_names, start)

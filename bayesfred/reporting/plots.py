@@ -448,11 +448,10 @@ def noise_plot(study: NoiseStudy) -> Figure:
             ax.tick_params(which="both", labelbottom=k + columns >= len(names), labelsize=8)
         if k < len(names) <= k + columns:
             ax.set_xlabel(VARIABLE_LABELS[abscissa], fontsize=8.5)
-    grey = {"color": "0.3"}
     handles = [
-        Line2D([], [], linewidth=1.0, label="Cramér–Rao bound", **grey),
-        Line2D([], [], linestyle="", marker="o", markersize=4.5, label="posterior sd", **grey),
-        Line2D([], [], linestyle="", marker="s", markersize=4.5, mfc="white", label="scatter of the estimates", **grey),
+        Line2D([], [], color="0.3", linewidth=1.0, label="Cramér–Rao bound"),
+        Line2D([], [], color="0.3", linestyle="", marker="o", markersize=4.5, label="posterior sd"),
+        Line2D([], [], color="0.3", linestyle="", marker="s", markersize=4.5, mfc="white", label="scatter of the estimates"),
         *(
             Line2D([], [], linewidth=3.0, color=ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)], label=label)
             for s, label in enumerate(series)
