@@ -205,7 +205,7 @@ def study(
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
-    s, simulation = run.study, run.simulation
+    s, simulation = run.study or settings.StudySettings(), run.simulation
     kind = kind or s.kind
     table = settings.within(".", s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv"), f"{run_file}: study.path")
     summary, picture = table.with_name(f"{table.stem}.summary.ecsv"), table.with_suffix(".png")

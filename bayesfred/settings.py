@@ -374,7 +374,7 @@ class RunSettings(_Section):
         Priors by parameter name, in place of the default ones.
     simulation : SimulationSettings, optional
         Used by `bayesfred simulate` and `bayesfred study`.
-    study : StudySettings
+    study : StudySettings, optional
         Used by `bayesfred study` only.
     """
 
@@ -390,7 +390,7 @@ class RunSettings(_Section):
     sampling: SamplingSettings = SamplingSettings()
     output: OutputSettings = OutputSettings()
     simulation: SimulationSettings | None = None
-    study: StudySettings = StudySettings()
+    study: StudySettings | None = None
 
 
 def read_settings(path: str | Path) -> RunSettings:
