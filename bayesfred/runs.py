@@ -253,16 +253,24 @@ def _studied(result: NoiseStudy | PosteriorCalibration) -> Table:
         rows = {key: values[result.cells["parameter"] == "theta"] for key, values in result.cells.items()}
         heads = [name for name in VARIABLES if len(set(rows[name])) > 1] or ["background"]
         heads += ["frames", "failed"]
-        shown = ["efficiency", "coverage_68", "coverage_95"]
+        shown = ["efficiency", "coverage_68", "coverage_95", "chi2", "lambda"]
     else:
-        rows, heads, shown = result.quantities, ["quantity"], ["coverage_68", "coverage_95", "pull"]
+        rows, heads, shown = result.quantities, ["quantity"], ["coverage_68", "coverage_95", "pull", "uniformity"]
     table = Table()
-    for head in (*heads, *shown, *(["uniformity"] if "uniformity" in rows else [])):
-        table.add_column(head.replace("_", " "), justify="right", no_wrap=True)
+    for head in (*heads, *shown):
+        table.add_column({"coverage_68": "% in 68 %", "coverage_95": "% in 95 %"}.get(head, head), justify="right", no_wrap=True)
+
+    def cell(key: str, k: int) -> str:
+        value = rows[key][k]
+        if key in ("chi2", "uniformity"):
+            return f"{value:.3g}"
+        if f"{key}_error" not in rows:
+            return f"{value:g}" if rows[key].dtype.kind == "f" else str(value)
+        factor, digits = (100.0, 1) if "coverage" in key else (1.0, 3)
+        return f"{factor * value:.{digits}f} ± {factor * rows[f'{key}_error'][k]:.{digits}f}"
+
     for k in range(len(rows[heads[0]])):
-        first = [f"{rows[h][k]:g}" if rows[h].dtype.kind == "f" else str(rows[h][k]) for h in heads]
-        measured = [f"{rows[h][k]:.3f} ± {rows[h + '_error'][k]:.3f}" for h in shown]
-        table.add_row(*first, *measured, *([f"{rows['uniformity'][k]:.2g}"] if "uniformity" in rows else []))
+        table.add_row(*(cell(key, k) for key in (*heads, *shown)))
     return table
 
 

@@ -227,10 +227,9 @@ def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCal
     n, n_failed = int(good.sum()), int((~good).sum())
     path = Path(how["path"])
     if n < 2:
-        reason = rows["message"][0] if n_failed else "none was made"
-        return PosteriorCalibration(
-            path, False, f"not calibrated: no posterior of {n_failed} frames ({reason})", n, n_failed, {}, {}
-        )
+        reason = rows["message"][~good][0]
+        message = f"not calibrated: no posterior of {n_failed} frames ({reason})"
+        return PosteriorCalibration(path, False, message, n, n_failed, {}, {"quantity": np.empty(0, "U1")})
     table: list[dict[str, Any]] = []
     pits: dict[str, Floats] = {}
     checks: list[tuple[float, str]] = []
