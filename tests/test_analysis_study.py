@@ -309,6 +309,26 @@ def test_a_pool_gives_the_same_bits_and_gets_the_study_once_a_worker(tmp_path: P
     assert executor.studies <= 4 < 20 <= executor.sent
 
 
+ORPHAN = """
+import os, signal
+from bayesfred.analysis import tasks
+
+if __name__ == "__main__":
+    with tasks._executor(None, 2) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_processes_of_a_pool_end_with_a_study_that_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "orphan.py"
+    script.write_text(ORPHAN, encoding="utf-8")
+    # returns when nobody has the pipes open any more
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert done.stdout.strip().isdigit()
+
+
 class Forgetful:
     """Workers that join late: the first three tasks meet one that lacks the study, whatever was sent before."""
 

@@ -13,6 +13,7 @@ import os
 import queue
 import signal
 import socket
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -210,16 +211,24 @@ def _executor(executor: Executor | None, workers: int | None) -> Iterator[Execut
     elif workers == 1:
         yield _Here()
     else:
-        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_leave_interrupts)
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_follow)
         try:
             yield pool
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _leave_interrupts() -> None:
-    """A terminal's Ctrl-C goes to the whole group of processes; the one that keeps the answers ends the others."""
+def _follow() -> None:
+    """Begin a process of the pool: it ends with the one that keeps the answers, and not by a Ctrl-C, which goes to all of them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
