@@ -1,5 +1,7 @@
 from . import runs
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.sbc import PosteriorCalibration, calibrate_posterior
+from .analysis.study import NoiseStudy, noise_study
 from .errors import InputError
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
 from .imaging.distortion import PolynomialDistortion
@@ -26,15 +28,19 @@ __all__ = [
     "LogDistortion",
     "MapEstimate",
     "MoffatPSF",
+    "NoiseStudy",
     "Nuisances",
     "PoissonNoise",
     "PolynomialDistortion",
     "Posterior",
+    "PosteriorCalibration",
     "SampledPSF",
     "SourceCatalog",
+    "calibrate_posterior",
     "correct_sampling",
     "diagnose",
     "find_map",
+    "noise_study",
     "open_chain",
     "runs",
     "sample",

@@ -1,6 +1,7 @@
 """From the settings of a run file to the objects that they describe."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -76,14 +77,18 @@ def noise_model(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
     return BackgroundNoise() if run.noise.kind == "background" else PoissonNoise(run.noise.read_noise)
 
 
+def priors_given(run: settings.RunSettings) -> dict[str, Any]:
+    """The priors of [prior]."""
+    return {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
+
+
 def posterior_given(
     run: settings.RunSettings, model: ForwardModel, counts: Floats, mask: npt.NDArray[np.bool_] | None
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
     n = run.nuisances
     nuisances = Nuisances(n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint, n.position_scatter)
-    prior = {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
-    return Posterior(model, counts, prior=prior, noise=noise_model(run), mask=mask, nuisances=nuisances)
+    return Posterior(model, counts, prior=priors_given(run), noise=noise_model(run), mask=mask, nuisances=nuisances)
 
 
 def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:

@@ -1,10 +1,11 @@
 """The command line: options in, exit codes out. What a command does is in `runs.py`.
 
-Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, or not verified, 130 interrupted, or
+Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, verified or calibrated, 130 interrupted, or
 terminated, with everything saved.
 """
 
 import signal
+from enum import StrEnum
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -59,6 +60,32 @@ def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> 
     _run(lambda: bf.runs.fit(run_file, resume=resume, overwrite=overwrite).diagnostics.converged)
 
 
+class Kind(StrEnum):
+    """Kinds of studies."""
+
+    noise = "noise"
+    sbc = "sbc"
+
+
+@app.command()
+def study(
+    run_file: Run,
+    kind: Annotated[
+        Kind | None, typer.Option(help="Noise levels, or simulation-based calibration.", show_default="the run file's")
+    ] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster in place of a pool.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes of the pool.", show_default="one a core")] = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Fit many simulated frames: how well a distortion can be known, and whether error bars hold."""
+    _run(
+        lambda: bf.runs.study(
+            run_file, kind=kind and kind.value, scheduler=scheduler, workers=workers, resume=resume, overwrite=overwrite
+        )
+    )
+
+
 @app.command()
 def report(
     chain_file: ChainFile,
@@ -88,7 +115,7 @@ def _run(work: "Callable[[], bool | None]") -> None:
         typer.echo(f"bayesfred: {error}", err=True)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
-        typer.echo("bayesfred: interrupted; a run that was sampling has saved its steps: go on with --resume", err=True)
+        typer.echo("bayesfred: interrupted; what a run has sampled or a study has finished is saved: go on with --resume", err=True)
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -16,7 +16,7 @@ import math
 import os
 import secrets
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 from bayesfred.errors import InputError, printable
 
 __all__ = [
-    "CatalogueRecord", "FrameRecord", "read_catalogue", "read_frame", "require_memory", "write_bytes", "write_catalogue",
-    "write_frame",
+    "CatalogueRecord", "FrameRecord", "TableRecord", "appending", "read_catalogue", "read_frame", "read_table", "require_memory",
+    "write_bytes", "write_catalogue", "write_frame", "write_table",
 ]  # fmt: skip
 
 _FITS_SUFFIXES = (".fits", ".fit", ".fts")
@@ -83,6 +83,22 @@ class CatalogueRecord:
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     flux: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TableRecord:
+    """A table of results.
+
+    Attributes
+    ----------
+    columns : dict of str to ndarray, shape (n,)
+        Numbers or texts by name.
+    meta : dict
+        What the numbers are: plain values, lists and dicts of them.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    meta: dict[str, Any]
 
 
 def read_frame(
@@ -289,6 +305,116 @@ def write_catalogue(path: str | Path, record: CatalogueRecord, *, overwrite: boo
     buffer = io.StringIO()
     Table([record.x, record.y, record.flux], names=["x", "y", "flux"]).write(buffer, format=table_format)
     write_bytes(path, buffer.getvalue().encode(), overwrite=overwrite)
+
+
+def read_table(path: str | Path) -> TableRecord:
+    """Read a table that `write_table` wrote, with the rows that were appended since.
+
+    Parameters
+    ----------
+    path : str or Path
+        An .ecsv file. A last row that was cut short, as by a kill, is left out.
+
+    Returns
+    -------
+    TableRecord
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged or no such table.
+    """
+    path = Path(path)
+    _require_file(path)
+    with _readable(path, "table"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        lines = path.read_text(encoding="utf-8")
+        table = Table.read(lines[: lines.rfind("\n") + 1].splitlines(), format="ascii.ecsv", fill_values=None)
+    return TableRecord({name: np.asarray(table[name]) for name in table.colnames}, dict(table.meta))
+
+
+def write_table(path: str | Path, record: TableRecord, *, overwrite: bool = False) -> None:
+    """Write a table as ECSV, every digit kept: `astropy.table.Table.read` and anything that reads CSV understand it.
+
+    Parameters
+    ----------
+    path : str or Path
+        An .ecsv file.
+    record : TableRecord
+    overwrite : bool
+        Replace a file that exists.
+
+    Raises
+    ------
+    InputError
+        The suffix is another; the file exists; the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_table(f"{folder}/t.ecsv", TableRecord({"x": np.array([0.1]), "note": np.array(["a, b"])}, {"seed": 1}))
+    ...     with appending(Path(folder, "t.ecsv")) as append:
+    ...         append([0.2, "c"])
+    ...     table = read_table(f"{folder}/t.ecsv")
+    >>> table.columns["x"].tolist(), table.columns["note"].tolist(), table.meta["seed"]
+    ([0.1, 0.2], ['a, b', 'c'], 1)
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".ecsv":
+        raise InputError(f"{path}: got a table file ending in {path.suffix!r}, expected .ecsv")
+    buffer = io.StringIO()
+    Table(dict(record.columns), meta=dict(record.meta)).write(buffer, format="ascii.ecsv", delimiter=",")
+    write_bytes(path, buffer.getvalue().encode(), overwrite=overwrite)
+
+
+@contextlib.contextmanager
+def appending(path: Path) -> Iterator[Callable[[Sequence[float | str]], None]]:
+    """Append rows to a table that `write_table` wrote; each is in the file, in one write, before the next is begun.
+
+    Parameters
+    ----------
+    path : Path
+        The table. A last row that was cut short is removed first.
+
+    Yields
+    ------
+    callable
+        Takes one row, numbers and texts in the order of the columns.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+
+    def cell(value: float | str) -> str:
+        return f'"{printable(value).replace(chr(34), chr(39))}"' if isinstance(value, str) else repr(value)
+
+    def append(row: Sequence[float | str]) -> None:
+        line = (",".join(map(cell, row)) + "\n").encode()
+        with _writable(path):
+            while line:
+                line = line[stream.write(line) :]
+
+    with _writable(path):
+        stream = path.open("r+b", buffering=0)
+    with stream:
+        with _writable(path):
+            stream.truncate(stream.read().rfind(b"\n") + 1)
+            stream.seek(0, io.SEEK_END)
+        yield append
+        with _writable(path):
+            os.fsync(stream.fileno())
+
+
+@contextlib.contextmanager
+def _writable(path: Path) -> Iterator[None]:
+    """Turn what a disk refuses into one line."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}), expected room and a file that can be") from error
 
 
 def write_bytes(path: Path, content: bytes, *, overwrite: bool = False) -> None:

@@ -3,13 +3,13 @@
 `cli.py` is the same from a shell; `assembly.py` makes the settings objects.
 """
 
-import io
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from bayesfred import assembly, files, settings
+from bayesfred.analysis import tasks
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
+from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
+from bayesfred.analysis.study import VARIABLES, NoiseStudy, noise_study
 from bayesfred.errors import InputError, printable
 from bayesfred.inference import verification
 from bayesfred.inference.chainfile import Chain, open_chain
@@ -143,10 +146,20 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
     output = _output(run, run_file)
-    f = run.frame
-    path = settings.resolve(f.path, run_file, must_exist=True)
+    path = settings.resolve(run.frame.path, run_file, must_exist=True)
     if os.path.exists(output) and output.samefile(path):
         raise InputError(f"{run_file}: output.path: got the frame's file, expected another: the chain would replace the frame")
+    posterior, notes = _framed(run, run_file)
+    if run.output.path is None and not output.parent.is_dir():
+        with _writing(output):
+            output.parent.mkdir()
+    return _fit(posterior, output, run, run_file, notes, resume=resume, overwrite=overwrite)
+
+
+def _framed(run: settings.RunSettings, run_file: Path) -> tuple[Posterior, list[str]]:
+    """The posterior of the frame that a run file names, and what there is to say about the frame."""
+    f = run.frame
+    path = settings.resolve(f.path, run_file, must_exist=True)
     frame = files.read_frame(path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name)
     print(frame.description)
     ny, nx = frame.counts.shape
@@ -156,10 +169,111 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     with _naming(run_file):
         model = assembly.forward_model(run, (ny, nx), sources, psf)
         posterior = assembly.posterior_given(run, model, frame.counts, frame.valid)
-    if run.output.path is None and not output.parent.is_dir():
-        with _writing(output):
-            output.parent.mkdir()
-    return _fit(posterior, output, run, run_file, [frame.description, census], resume=resume, overwrite=overwrite)
+    return posterior, [frame.description, census]
+
+
+def study(
+    run_file: PathLike,
+    *,
+    kind: str | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> bool:
+    """Do the study of a run file's [study]: a table with a row a frame, a summary and a picture beside it.
+
+    Parameters
+    ----------
+    run_file : path-like
+    kind : {"noise", "sbc"}, optional
+        By default the run file's.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers do the work; by default a pool of processes does.
+    workers : int, optional
+        Processes of that pool, by default one a core.
+    resume, overwrite : bool
+        Go on with the study in the table; replace it.
+
+    Returns
+    -------
+    bool
+        Whether every frame could be fitted and, in a calibration, the error bars hold.
+
+    Raises
+    ------
+    InputError
+        If the run file is unusable, describes no study, or the table exists.
+    """
+    run_file = Path(run_file)
+    run = settings.read_settings(run_file)
+    s, simulation = run.study or settings.StudySettings(), run.simulation
+    kind = kind or s.kind
+    table = settings.within(".", s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv"), f"{run_file}: study.path")
+    summary, picture = table.with_name(f"{table.stem}.summary.ecsv"), table.with_suffix(".png")
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite: got both, expected one: go on with the study, or replace it")
+    for path in (table, summary, picture):
+        if os.path.lexists(path) and not (overwrite or resume):
+            raise InputError(f"{path}: exists, expected a new file: go on with --resume, or replace it with --overwrite")
+    if simulation is None and kind == "noise":
+        raise InputError(f"{run_file}: simulation: no such section, expected shape, theta and background: see bayesfred fit --help")
+    posterior, truth = assembly.simulated(run, run_file, simulation.seed) if simulation else (_framed(run, run_file)[0], None)
+    if s.path is None and not table.parent.is_dir():
+        with _writing(table):
+            table.parent.mkdir()
+    with ExitStack() as stack:
+        stack.enter_context(_naming(run_file))
+        executor = stack.enter_context(tasks.cluster(scheduler)) if scheduler else None
+        how: dict[str, Any] = {
+            "replicates": s.replicates, "seed": s.seed, "path": table, "executor": executor, "workers": workers, "resume": resume,
+            "overwrite": overwrite,
+        }  # fmt: skip
+        if kind == "noise" and simulation is not None and truth is not None:
+            model = posterior.model
+            result: NoiseStudy | PosteriorCalibration = noise_study(
+                model, truth[: model.distortion.n_terms], s.background or simulation.background, flux=s.flux or (),
+                sources=s.sources or (), psf_sigma=s.psf_sigma or (), exposure=s.exposure or (), method=s.method or "laplace",
+                noise=posterior.noise, nuisances=posterior.nuisances, prior=assembly.priors_given(run), **how,
+            )  # fmt: skip
+        else:
+            result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)
+    found = result.cells if isinstance(result, NoiseStudy) else result.quantities
+    files.write_table(summary, files.TableRecord(found, {"study": kind, "message": result.message}), overwrite=True)
+    figure = plots.noise_plot(result) if isinstance(result, NoiseStudy) else plots.calibration_plot(result)
+    files.write_bytes(picture, plots.png(figure), overwrite=True)
+    Console(width=None if sys.stdout.isatty() else 120).print(_studied(result))
+    print(result.message)
+    for label, path in (("table", table), ("summary", summary), ("picture", picture)):
+        print(f"{label:8}{printable(str(path))}")
+    return result.calibrated if isinstance(result, PosteriorCalibration) else not result.cells["failed"].any()
+
+
+def _studied(result: NoiseStudy | PosteriorCalibration) -> Table:
+    """A study's findings: a row a noise level, or a row a quantity."""
+    if isinstance(result, NoiseStudy):
+        rows = {key: values[result.cells["parameter"] == "theta"] for key, values in result.cells.items()}
+        heads = [name for name in VARIABLES if len(set(rows[name])) > 1] or ["background"]
+        heads += ["frames", "failed"]
+        shown = ["efficiency", "coverage_68", "coverage_95", "chi2", "lambda"]
+    else:
+        rows, heads, shown = result.quantities, ["quantity"], ["coverage_68", "coverage_95", "pull", "uniformity"]
+    table = Table()
+    for head in (*heads, *shown):
+        table.add_column({"coverage_68": "% in 68 %", "coverage_95": "% in 95 %"}.get(head, head), justify="right", no_wrap=True)
+
+    def cell(key: str, k: int) -> str:
+        value = rows[key][k]
+        if key in ("chi2", "uniformity"):
+            return f"{value:.3g}"
+        if f"{key}_error" not in rows:
+            return f"{value:g}" if rows[key].dtype.kind == "f" else str(value)
+        factor, digits = (100.0, 1) if "coverage" in key else (1.0, 3)
+        return f"{factor * value:.{digits}f} ± {factor * rows[f'{key}_error'][k]:.{digits}f}"
+
+    for k in range(len(rows[heads[0]])):
+        table.add_row(*(cell(key, k) for key in (*heads, *shown)))
+    return table
 
 
 def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
@@ -304,9 +418,7 @@ def _report(
     expected = posterior.expected_counts(chain.estimate.params)
     sigma = posterior.sigma(chain.estimate.params)
     figure = plots.overview(posterior.counts, expected, sigma, posterior.mask, chain.draws(), chain.parameter_names, truth=truth)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=150)
-    files.write_bytes(picture, buffer.getvalue(), overwrite=True)
+    files.write_bytes(picture, plots.png(figure), overwrite=True)
     print(diagnostics.message)
     for label, path in (("chain", chain.path), ("report", page), ("picture", picture)):
         print(f"{label:8}{printable(str(path))}")

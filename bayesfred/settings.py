@@ -345,6 +345,45 @@ class SimulationSettings(_Section):
     grid: GridSettings | None = None
 
 
+class StudySettings(_Section):
+    """`[study]`: what `bayesfred study` simulates and fits.
+
+    Attributes
+    ----------
+    kind : {'noise', 'sbc'}
+        Fits of the truth of [simulation] at several noise levels, or simulation-based calibration: truths from the priors.
+    replicates : int
+        Frames of every noise level, or of the calibration.
+    method : {'laplace', 'mcmc'}, optional
+        The maximum with its Fisher information, or draws; by default the first for 'noise', the second for 'sbc'.
+    seed : int
+        Seed of every random number.
+    background : tuple of float, optional, counts per pixel
+        Noise levels; every combination of these and the following is one.
+    flux : tuple of float, optional, counts
+        Mean fluxes of the sources.
+    sources : tuple of int, optional
+        Numbers of sources: the brightest, and of equally bright ones those that lie farthest apart.
+    psf_sigma : tuple of float, optional, pixel
+        Widths of the PSF.
+    exposure : tuple of float, optional
+        Factors of flux and background together.
+    path : str, optional
+        The table of results, .ecsv, inside the folder that the study is started in.
+    """
+
+    kind: Literal["noise", "sbc"] = "noise"
+    replicates: Annotated[int, Field(ge=2, le=10**7)] = 100
+    method: Literal["laplace", "mcmc"] | None = None
+    seed: _Seed = 1
+    background: tuple[_Positive, ...] | None = None
+    flux: tuple[_Positive, ...] | None = None
+    sources: tuple[_Count, ...] | None = None
+    psf_sigma: tuple[_Positive, ...] | None = None
+    exposure: tuple[_Positive, ...] | None = None
+    path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None
+
+
 class RunSettings(_Section):
     """A whole run file, one attribute a section.
 
@@ -357,7 +396,9 @@ class RunSettings(_Section):
     prior : dict of PriorSettings
         Priors by parameter name, in place of the default ones.
     simulation : SimulationSettings, optional
-        Used by `bayesfred simulate` only.
+        Used by `bayesfred simulate` and `bayesfred study`.
+    study : StudySettings, optional
+        Used by `bayesfred study` only.
     """
 
     frame: FrameSettings
@@ -372,6 +413,7 @@ class RunSettings(_Section):
     sampling: SamplingSettings = SamplingSettings()
     output: OutputSettings = OutputSettings()
     simulation: SimulationSettings | None = None
+    study: StudySettings | None = None
 
 
 def read_settings(path: str | Path) -> RunSettings:

@@ -92,7 +92,7 @@ MAY_IMPORT = {
     "errors": (),
     "imaging": ("errors",),
     "inference": ("errors", "imaging"),
-    "analysis": ("errors", "imaging", "inference"),
+    "analysis": ("errors", "imaging", "inference", "files"),  # a study's rows are kept on disk as they come
     "reporting": ("errors", "imaging", "inference", "analysis"),
     "files": ("errors",),
     "settings": ("errors",),
@@ -237,7 +237,7 @@ FENCES: dict[str, tuple[str, ...]] = {
     "jinja2": ("reporting.html",),
     "filelock": ("inference.lock",),
     "dask": (),
-    "distributed": (),
+    "distributed": ("analysis.tasks",),
 }
 
 
@@ -272,7 +272,7 @@ def attributes(source: str, name: str) -> set[str]:
 
 def test_posterior_asks_numba_for_threads_alone() -> None:
     """The one exception to numba's fence: how many threads there are and may be used."""
-    assert attributes(SOURCES["bayesfred.inference.posterior"], "numba") == {"config", "get_num_threads"}
+    assert attributes(SOURCES["bayesfred.inference.posterior"], "numba") == {"config", "get_num_threads", "set_num_threads"}
     assert attributes("import numba\n@numba.njit\ndef f(x):\n    return x", "numba") == {"njit"}
     assert attributes("from numba import njit", "numba") == {"njit"}
 
@@ -429,7 +429,7 @@ def test_public_names_are_documented(name: str) -> None:
     assert undocumented(SOURCES[defined_in(name)], name) == []
 
 
-@pytest.mark.parametrize("name", ["demo", "fit", "report", "simulate_frame", "verify"])
+@pytest.mark.parametrize("name", ["demo", "fit", "report", "simulate_frame", "study", "verify"])
 def test_runs_are_documented(name: str) -> None:
     assert undocumented(SOURCES["bayesfred.runs"], name) == []
 
@@ -552,7 +552,8 @@ LONG = {
     "bayesfred.inference.posterior": "one class, whose methods share the frame as the loops read it",
     "bayesfred.settings": "one record a section, most of it what the fields mean",
     "bayesfred.files": "three formats of frames and two of catalogues, most of it what damaged files get wrong",
-    "bayesfred.reporting.plots": "seven independent figures with one style",
+    "bayesfred.reporting.plots": "nine independent figures with one style",
+    "bayesfred.runs": "one function a command, and what they share",
 }
 
 

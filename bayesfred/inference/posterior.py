@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.special import gammaln
 
 from bayesfred.errors import InputError
-from bayesfred.imaging._kernels import SEGMENT, Basis, Optics, stride
+from bayesfred.imaging._kernels import SEGMENT, Basis, Optics, image, stride
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.inference import _kernels, priors
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, read_noise_model
@@ -47,6 +47,17 @@ def _forget_threads() -> None:
 
 
 os.register_at_fork(after_in_child=_forget_threads)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Evaluate ensembles in the calling thread alone: for work of which every core does its own."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
@@ -404,6 +415,30 @@ class Posterior:
         curvature = [max(priors.slope(p, x)[1], 0.0) for p, x in zip(self.prior.values(), vector, strict=True)]
         return self.fisher(vector) + np.diag(curvature)
 
+    def simulate(self, params: npt.ArrayLike, rng: np.random.Generator) -> Floats | None:
+        """Draw a frame given the parameters; what is not sampled, free fluxes and the sources' shifts, is drawn from its prior.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx), counts
+            None where the posterior would have no density: a source is folded or has no image, or expected counts are negative.
+        """
+        vector = self._vectors(params)[0]
+        theta, nuisances, background = (a[0] for a in self._arguments(vector[None]))
+        scale, *offset, sigma, scatter = (float(value) for value in nuisances)
+        flux = scale * self._flux if not self._free else self._flux * rng.gamma(2.0, 0.5, self._flux.size)
+        ny, nx = self.model.detector.shape
+        optics, out = self._optics, np.zeros(ny * stride(nx))
+        unfolded = image(optics, theta, *offset, sigma, flux, out)
+        if scatter:  # a shift is as imaged: it moves the image, and leaves the distortion that of the catalogue's position
+            by_x, by_y = scatter * rng.standard_normal((2, flux.size))
+            out[:] = 0.0
+            image(optics._replace(x=optics.x + by_x, y=optics.y + by_y), theta, *offset, sigma, flux, out)
+        sources, level = out.reshape(ny, -1)[:, :nx], self._polynomial(background) - self.noise.shift
+        if not (unfolded and np.all((sources + level)[self.mask] >= 0.0)):
+            return None
+        return self.noise.draw(sources, np.maximum(level, -sources), rng)
+
     def expected_counts(self, params: npt.ArrayLike) -> Floats:
         """Expected counts of every pixel, free fluxes at their most likely values; NaN where a map folds.
 
@@ -428,11 +463,14 @@ class Posterior:
         ny, nx = self.model.detector.shape
         with self._drawn(arguments) as (w, drawn):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
-        u, v = (np.arange(1 - n, n, 2) / n for n in (nx, ny))
-        order = self.nuisances.background_order + 1
-        background = np.polynomial.polynomial.polygrid2d(u, v, _square(arguments[2])[:order, :order]).T
         bad = 0.0 if drawn.extra > -np.inf else np.nan
-        return sources + background - self.noise.shift + bad, drawn.fitted.fluxes + bad
+        return sources + self._polynomial(arguments[2]) - self.noise.shift + bad, drawn.fitted.fluxes + bad
+
+    def _polynomial(self, background: Floats) -> Floats:
+        """The background polynomial at every pixel."""
+        u, v = (np.arange(1 - n, n, 2) / n for n in self.model.detector.shape[::-1])
+        order = self.nuisances.background_order + 1
+        return np.asarray(np.polynomial.polynomial.polygrid2d(u, v, _square(background)[:order, :order]).T)
 
     def start(self) -> Floats:
         """Parameters to begin a search from: no distortion, the frame's median as background, nuisances as given."""

@@ -7,6 +7,7 @@ from the middle of the frame, as the model counts them. `bayesfred.reporting.htm
 page.
 """
 
+import io
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -25,14 +26,21 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
 
+from bayesfred.analysis.refit import LEVELS
+from bayesfred.analysis.sbc import PosteriorCalibration
+from bayesfred.analysis.study import VARIABLES, NoiseStudy
+from bayesfred.analysis.uniformity import band, ecdf, points
 from bayesfred.inference.chainfile import Chain
 
 __all__ = [
+    "calibration_plot",
     "corner_plot",
     "frame_triptych",
+    "noise_plot",
     "overview",
     "parameter_powers",
     "parameter_unit",
+    "png",
     "power_of_ten",
     "star_panels",
     "trace_plot",
@@ -48,6 +56,13 @@ TRIPTYCH_MARGIN, TRIPTYCH_SIDE = 0.7, 5.6
 MAX_STARS = 24
 MAX_CORNER_DRAWS = 20_000
 MAX_TRACE_STEPS = 1_000
+VARIABLE_LABELS = {
+    "background": "background / counts per pixel",
+    "flux": "mean flux / counts",
+    "sources": "number of sources",
+    "psf_sigma": "PSF sigma / pixel",
+    "exposure": "exposure / the model's",
+}
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -357,8 +372,8 @@ def overview(
     _draw_triptych(fig, upper.subplots(1, 3), counts, expected, sigma, mask)
     ax = lower.subplots()
     place = np.arange(len(kept))
-    for band in (1.0, 2.0):
-        ax.axhspan(-band, band, color="0.4", alpha=0.11, linewidth=0)
+    for reach in (1.0, 2.0):
+        ax.axhspan(-reach, reach, color="0.4", alpha=0.11, linewidth=0)
     ax.axhline(0.0, color="0.3", linewidth=0.8)
     ax.errorbar(place, z, yerr=1.0, fmt="o", color=POSTERIOR_COLOUR, capsize=4, markersize=6)
     if truth is None:
@@ -374,6 +389,161 @@ def overview(
     ticks = [f"{_symbol(names[k])}\n{_plain(mean[k], sd[k])}" for k in kept]
     ax.set_xticks(place, ticks, fontsize=9 if len(kept) <= 16 else 7, rotation=0 if len(kept) <= 16 else 60)
     return fig
+
+
+def noise_plot(study: NoiseStudy) -> Figure:
+    """Every parameter's width over the noise level with the bound, the efficiency, and how many intervals hold the truth.
+
+    Parameters
+    ----------
+    study : NoiseStudy
+        Its first variable of several values is the abscissa; combinations of the others are series.
+
+    Returns
+    -------
+    Figure
+    """
+    cells = study.cells
+    varied = [name for name in VARIABLES if len(set(cells[name])) > 1] or [VARIABLES[0]]
+    abscissa, others = varied[0], varied[1:]
+    of = np.array(
+        [", ".join(f"{name.replace('_', ' ')} {cells[name][k]:g}" for name in others) for k in range(len(cells["failed"]))]
+    )
+    series = list(dict.fromkeys(of.tolist()))
+    names = study.parameter_names
+    rows = -(-len(names) // 4)
+    columns = max(-(-len(names) // rows), 2)
+    heights = (0.6 + 2.6 * rows, 3.6)
+    fig = Figure(figsize=(3.6 * max(columns, 3), sum(heights)), dpi=100, layout="constrained")
+    parts: Any = fig.subfigures(2, 1, height_ratios=heights)
+    upper, lower = parts
+    widths = upper.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    efficiency, coverage = lower.subplots(1, 2)
+    for s, label in enumerate(series):
+        colour = ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)]
+        aside = 1.0 + 0.05 * (s - 0.5 * (len(series) - 1))  # so that points of a noise level do not hide each other
+        for ax, name in zip(widths, names, strict=False):
+            mine = np.flatnonzero((cells["parameter"] == name) & (of == label))
+            x, width, bound, scatter = (cells[key][mine] for key in (abscissa, "width", "bound", "scatter"))
+            order = np.argsort(x)
+            error = scatter / np.sqrt(2.0 * np.maximum(cells["frames"][mine] - 1, 1))
+            ax.plot(x[order], bound[order], color=colour, linewidth=1.0)
+            ax.errorbar(x * 1.04, scatter, error, fmt="s", mfc="white", color=colour, markersize=4.5, linewidth=1.0)
+            ax.plot(x / 1.04, width, "o", color=colour, markersize=4.5)
+        mine = np.flatnonzero((cells["parameter"] == "theta") & (of == label))
+        x = cells[abscissa][mine] * aside
+        efficiency.errorbar(x, cells["efficiency"][mine], cells["efficiency_error"][mine], fmt="o", color=colour, capsize=3)
+        for level, mark in zip(LEVELS, "os", strict=True):
+            key = f"coverage_{100 * level:.0f}"
+            coverage.errorbar(x, cells[key][mine], cells[f"{key}_error"][mine], fmt=mark, color=colour, capsize=3)
+    every = cells[abscissa]
+    for ax in (*widths[: len(names)], efficiency, coverage):
+        ax.set_xscale("log" if every.max() > 3.0 * every.min() else "linear")
+        ax.tick_params(labelsize=8)
+    for k, ax in enumerate(widths):
+        ax.set_visible(k < len(names))
+        if k < len(names):
+            ax.set_yscale("log")
+            ax.set_title("sd of " + _label(names[k], 0), fontsize=9.5)
+            ax.tick_params(which="both", labelbottom=k + columns >= len(names), labelsize=8)
+        if k < len(names) <= k + columns:
+            ax.set_xlabel(VARIABLE_LABELS[abscissa], fontsize=8.5)
+    handles = [
+        Line2D([], [], color="0.3", linewidth=1.0, label="Cramér–Rao bound"),
+        Line2D([], [], color="0.3", linestyle="", marker="o", markersize=4.5, label="posterior sd"),
+        Line2D([], [], color="0.3", linestyle="", marker="s", markersize=4.5, mfc="white", label="scatter of the estimates"),
+        *(
+            Line2D([], [], linewidth=3.0, color=ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)], label=label)
+            for s, label in enumerate(series)
+        ),
+    ][: 3 + (len(series) if others else 0)]
+    upper.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 6), frameon=False, fontsize=9)
+    efficiency.axhline(1.0, color="0.3", linewidth=0.8)
+    efficiency.set(
+        xlabel=VARIABLE_LABELS[abscissa], ylabel="bound / variance of the estimates", title="efficiency, all coefficients"
+    )
+    for level in LEVELS:
+        coverage.axhline(level, color="0.3", linewidth=0.8)
+    coverage.set(
+        xlabel=VARIABLE_LABELS[abscissa], ylabel="share of intervals that hold the truth", title="coverage, all coefficients"
+    )
+    low = min(0.5, float(np.nanmin(cells["coverage_68"][cells["parameter"] == "theta"], initial=0.5)) - 0.05)
+    coverage.set_ylim(low, 1.02)
+    coverage.set_yticks([*LEVELS, 1.0], [f"{level:.0%}" for level in (*LEVELS, 1.0)])
+    return fig
+
+
+def calibration_plot(calibration: PosteriorCalibration) -> Figure:
+    """Every quantity's ranks: their distribution less the uniform one with its 95 % band, coverage, and mean pulls.
+
+    Parameters
+    ----------
+    calibration : PosteriorCalibration
+
+    Returns
+    -------
+    Figure
+    """
+    n, names, found = calibration.n, list(calibration.pit), calibration.quantities
+    if not names:
+        fig = Figure(figsize=(8, 2), dpi=100)
+        fig.text(0.5, 0.5, "no frame has a posterior", ha="center", va="center")
+        return fig
+    columns = 4
+    rows = -(-len(names) // columns)
+    heights = (0.4 + 2.2 * rows, 3.9)
+    fig = Figure(figsize=(14, sum(heights)), dpi=100, layout="constrained")
+    parts: Any = fig.subfigures(2, 1, height_ratios=heights)
+    upper, lower = parts
+    z, (low, high) = points(n), band(n)
+    panels = upper.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for k, ax in enumerate(panels):
+        ax.set_visible(k < len(names))
+        if k < len(names):
+            off = ecdf(calibration.pit[names[k]])
+            left = np.any((off < low - 1e-9) | (off > high + 1e-9))
+            ax.fill_between(z, low - z, high - z, color="0.4", alpha=0.2, linewidth=0)
+            ax.step(z, off - z, where="post", color=TRUTH_COLOUR if left else POSTERIOR_COLOUR, linewidth=1.1)
+            ax.axhline(0.0, color="0.3", linewidth=0.6)
+            ax.set_title(f"{_quantity(names[k])}   p = {found['uniformity'][k]:.2g}", fontsize=9.5)
+            ax.tick_params(labelsize=8, labelbottom=k + columns >= len(names))
+            ax.set_xlim(0, 1)
+            if k % columns == 0:
+                ax.set_ylabel("ECDF - z", fontsize=8.5)
+            if k + columns >= len(names):
+                ax.set_xlabel("z: rank of the truth", fontsize=8.5)
+    upper.suptitle(f"{n} frames; band: 95 % of uniform ranks stay inside all along", fontsize=10)
+    coverage, pull = lower.subplots(1, 2)
+    place = np.arange(len(names))
+    for level, mark in zip(LEVELS, "os", strict=True):
+        key = f"coverage_{100 * level:.0f}"
+        coverage.axhline(level, color="0.3", linewidth=0.8)
+        coverage.errorbar(
+            place, found[key], yerr=found[f"{key}_error"], fmt=mark, color=POSTERIOR_COLOUR, capsize=3, markersize=4.5
+        )
+    coverage.set(title="share of intervals that hold the truth", ylim=(min(0.5, float(found["coverage_68"].min()) - 0.05), 1.02))
+    coverage.set_yticks([*LEVELS, 1.0], [f"{level:.0%}" for level in (*LEVELS, 1.0)])
+    error = 1.0 / math.sqrt(n)
+    pull.axhspan(-3.0 * error, 3.0 * error, color="0.4", alpha=0.15, linewidth=0)
+    pull.axhline(0.0, color="0.3", linewidth=0.8)
+    pull.errorbar(place, found["pull"], yerr=error, fmt="o", color=POSTERIOR_COLOUR, capsize=3, markersize=4.5)
+    reach = max(4.5 * error, 1.15 * float(np.abs(found["pull"]).max()) + error)
+    pull.set(title="mean of (posterior mean - truth) / sd; band: 3 standard errors", ylim=(-reach, reach))
+    for ax in (coverage, pull):
+        ax.set_xticks(place, [_quantity(name) for name in names], rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
+    return fig
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG file's content, 150 dots an inch."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=150)
+    return buffer.getvalue()
+
+
+def _quantity(name: str) -> str:
+    """What a calibration ranks: a parameter, the log-likelihood, or f or g at a point of the field."""
+    return re.sub(r"^([fg])\((.*)\)$", r"$\1$(\2) px", name) if "(" in name else _symbol(name)
 
 
 def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> None:

@@ -1,0 +1,268 @@
+"""Whether error bars hold: truths drawn from the prior, and where they lie among the draws of their frames' posteriors.
+
+Only for the exact posterior is the truth like one more draw, so that any error of model, optimiser or sampler shows in the ranks.
+
+References
+----------
+S. Talts, M. Betancourt, D. Simpson, A. Vehtari, A. Gelman (2018), arXiv:1804.06788. M. Modrak et al. (2023), Bayesian Analysis
+20, 461 (quantities that depend on the data, such as the log-likelihood).
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erfc
+
+from bayesfred.analysis.refit import LEVELS, Method, check, coverage_error, covered, draws, given, maximum, seeds
+from bayesfred.analysis.tasks import Executor, run
+from bayesfred.analysis.uniformity import uniformity
+from bayesfred.errors import InputError
+from bayesfred.inference.chainfile import fingerprint
+from bayesfred.inference.posterior import Posterior
+
+Floats = npt.NDArray[np.float64]
+
+__all__ = ["PosteriorCalibration", "calibrate_posterior"]
+
+RANKED = 200  # draws among which a truth is ranked, at least
+
+# Field points, in half-widths of the frame, where the displacement is judged.
+FIELD_POINTS = ((0.7, 0.4), (-0.4, 0.7), (0.9, -0.9))
+
+REDRAWS = 1000
+FALSE_ALARM = 0.01  # how often the verdict may refuse error bars that hold
+MOST_FAILED = 0.01  # share of frames without a posterior beyond which the others say nothing
+
+
+@dataclass(frozen=True)
+class _Calibration:
+    """The tasks of a calibration: a truth drawn from the prior, its frame, the posterior's draws, the truth's rank among them."""
+
+    posterior: Posterior
+    fitted: Posterior
+    method: Method
+    seed: int
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What is ranked."""
+        return (*self.posterior.parameter_names, "log_likelihood", *self._field)
+
+    @cached_property
+    def _field(self) -> dict[str, Floats]:
+        """f and g at points of the field, as far as they depend on theta: they are linear in it, with these factors."""
+        distortion = self.posterior.model.distortion
+        places = np.rint(0.5 * np.array(self.posterior.model.detector.fine_shape[::-1]) * FIELD_POINTS)
+        field: dict[str, Floats] = {}
+        for u, v in places:
+            both = np.array([distortion.displacement(unit, u, v, u, v) for unit in np.eye(distortion.n_terms)]).T
+            field |= {f"{letter}({u:+.0f}, {v:+.0f})": factors for letter, factors in zip("fg", both, strict=True) if factors.any()}
+        return field
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        each = (f"{name}.{what}" for name in self.quantities for what in ("truth", "mean", "sd", "pit"))
+        return ("draws", *each)
+
+    def contents(self) -> dict[str, str]:
+        fitted = {f"fitted {name}": value for name, value in fingerprint(self.fitted).items()}
+        return {**fingerprint(self.posterior), **fitted, "method": self.method, "seed": str(self.seed)}
+
+    def task(self, k: int) -> Sequence[float]:
+        for_truth, for_draws, for_ranks = seeds(self.seed, k).spawn(3)
+        truth, counts = self.truth(np.random.default_rng(for_truth))
+        posterior = given(self.fitted, counts)
+        drawn = self._judged(posterior, self.drawn(posterior, for_draws))
+        true = self._judged(posterior, truth[None])[0]
+        below, equal = (drawn < true).sum(axis=0), (drawn == true).sum(axis=0)
+        jitter = np.random.default_rng(for_ranks).random(true.size)
+        pit = (below + jitter * (equal + 1)) / (len(drawn) + 1)
+        each = np.stack([true, drawn.mean(axis=0), drawn.std(axis=0, ddof=1), pit], axis=1)
+        return (len(drawn), *each.ravel())
+
+    def drawn(self, posterior: Posterior, seed: np.random.SeedSequence) -> Floats:
+        """The posterior's draws."""
+        return draws(posterior, maximum(posterior), self.method, seed, RANKED)
+
+    def truth(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Parameters from the prior and a frame of theirs, drawn again where a map folds, as these have no prior probability."""
+        for _ in range(REDRAWS):
+            truth = np.array([prior.rvs(random_state=rng) for prior in self.posterior.prior.values()])
+            counts = self.posterior.simulate(truth, rng)
+            if counts is not None:
+                return truth, counts
+        raise InputError(f"prior: got {REDRAWS} draws that all fold a source's image, expected some that do not: narrow it")
+
+    def _judged(self, posterior: Posterior, params: Floats) -> Floats:
+        """The quantities that are ranked, shape (n, number)."""
+        likelihood = posterior.log_prob(params) - posterior.log_prior(params)
+        theta = params[:, : self.posterior.model.distortion.n_terms]
+        return np.stack([*params.T, likelihood, *(theta @ factors for factors in self._field.values())], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorCalibration:
+    """Whether a posterior's error bars hold.
+
+    Attributes
+    ----------
+    path : Path
+        The table with a row for every simulated frame.
+    calibrated : bool
+        Whether the truths are ranked among the posterior's draws as one more draw would be.
+    message : str
+        The verdict and its reasons, one line.
+    n : int
+        Frames that have a posterior.
+    n_failed : int
+        Frames that have none.
+    pit : dict of str to ndarray, shape (n,)
+        Randomised ranks of the truths, between 0 and 1, by quantity: every parameter, the log-likelihood, and f and g at
+        field points (pixel).
+    quantities : dict of str to ndarray
+        A row for each of them: see `calibrate_posterior`.
+    """
+
+    path: Path
+    calibrated: bool
+    message: str
+    n: int
+    n_failed: int
+    pit: dict[str, Floats]
+    quantities: dict[str, npt.NDArray[Any]]
+
+
+def calibrate_posterior(
+    posterior: Posterior,
+    *,
+    fitted: Posterior | None = None,
+    replicates: int = 1000,
+    method: Method = "mcmc",
+    path: str | os.PathLike[str],
+    seed: int,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> PosteriorCalibration:
+    """Simulation-based calibration: truths from the prior, ranked among the draws of their frames' posteriors.
+
+    Of each frame at least 200 draws an autocorrelation time apart are kept. With randomised ranks, the share of draws below the
+    truth is exactly uniform if and only if truth and draws come from one distribution.
+
+    Every row of `PosteriorCalibration.quantities` has the quantity's name; uniformity, the p-value of its ranks' whole distribution
+    function; coverage_68 and coverage_95, the shares of central intervals that hold the truth, with their binomial errors; bias,
+    the mean of (posterior mean - truth) with its error; pull, the mean of that difference over the posterior's sd, and pull_error,
+    1/sqrt(n). The verdict takes all p-values together, those of coverage and of pull too: posteriors that are exact are refused in
+    at most one study of 100 (Bonferroni), and so is a study in which over 1 % of the frames have no posterior.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of any frame: the model, priors, noise, mask and nuisances are used, the counts are not. Every prior has to be proper, and
+        all are here; the default ones are broad, so that a study may rather be of narrower ones.
+    fitted : Posterior, optional
+        What is fitted, if it is another than what frames are drawn from: to see what a wrong model does to the error bars.
+    replicates : int
+        Frames to simulate.
+    method : {"mcmc", "laplace"}
+        Draws of the sampler, or of the Laplace approximation, to see whether that suffices.
+    path, seed, executor, workers, resume, overwrite, progress
+        As of `noise_study`.
+
+    Returns
+    -------
+    PosteriorCalibration
+
+    Raises
+    ------
+    InputError
+        If the posteriors differ in parameters, the file exists or holds another study, or a worker dies.
+    KeyboardInterrupt
+        After every finished frame was kept.
+
+    References
+    ----------
+    S. Talts et al. (2018), arXiv:1804.06788. T. Saeilynoja, P.-C. Buerkner, A. Vehtari (2022), Statistics and Computing 32, 32.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((41, 41)), bf.SourceCatalog.grid(3, 12.0, 1e3), bf.GaussianPSF(2.0),
+    ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
+    >>> posterior = bf.Posterior(model, bf.simulate(model, [0.0], 2.0, seed=1))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     study = calibrate_posterior(posterior, replicates=20, path=f"{folder}/sbc.ecsv", seed=1, workers=1, progress=False)
+    >>> study.calibrated, study.n, study.quantities["quantity"][:3].tolist()
+    (True, 20, ['f_ux', 'background', 'log_likelihood'])
+    """
+    check("calibration", replicates, method)
+    judged = fitted or posterior
+    if judged.parameter_names != posterior.parameter_names:
+        raise InputError(
+            f"calibration: fitted: got the parameters {', '.join(judged.parameter_names)}, expected those of the posterior: "
+            f"{', '.join(posterior.parameter_names)}"
+        )
+    return _calibrate(
+        _Calibration(posterior, judged, method, seed), replicates, path=path, executor=executor, workers=workers, resume=resume,
+        overwrite=overwrite, progress=progress,
+    )  # fmt: skip
+
+
+def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCalibration:
+    """Run a calibration's tasks and judge them."""
+    meta = {"study": "sbc", "seed": study.seed, "method": study.method, "replicates": replicates}
+    rows = run(study, replicates, meta=meta, **how).columns
+    good = rows["message"] == ""
+    n, n_failed = int(good.sum()), int((~good).sum())
+    path = Path(how["path"])
+    if n < 2:
+        reason = rows["message"][~good][0]
+        message = f"not calibrated: no posterior of {n_failed} frames ({reason})"
+        return PosteriorCalibration(path, False, message, n, n_failed, {}, {"quantity": np.empty(0, "U1")})
+    table: list[dict[str, Any]] = []
+    pits: dict[str, Floats] = {}
+    checks: list[tuple[float, str]] = []
+    for name in study.quantities:
+        truth, mean, sd, pit = (rows[f"{name}.{what}"][good] for what in ("truth", "mean", "sd", "pit"))
+        pits[name] = pit
+        pull, off = (mean - truth) / sd, mean - truth
+        row: dict[str, Any] = {"quantity": name, "uniformity": uniformity(pit)}
+        checks.append((row["uniformity"], f"ranks of {name} are not uniform"))
+        for level in LEVELS:
+            key, share = f"coverage_{100 * level:.0f}", float(covered(pit, level).mean())
+            row |= {key: share, f"{key}_error": coverage_error(level, n)}
+            checks.append(
+                (_chance((share - level) / coverage_error(level, n)), f"{level:.0%} intervals of {name} hold {share:.1%}")
+            )
+        row |= {"bias": float(off.mean()), "bias_error": float(off.std(ddof=1)) / math.sqrt(n)}
+        row |= {"pull": float(pull.mean()), "pull_error": 1.0 / math.sqrt(n)}
+        if name != "log_likelihood":  # whose posterior is not symmetric
+            checks.append((_chance(row["pull"] * math.sqrt(n)), f"mean pull of {name} is {row['pull']:+.3f}"))
+        table.append(row)
+    failures = [(p, text) for p, text in sorted(checks) if p * len(checks) < FALSE_ALARM]
+    reasons = [f"{text} (p = {p:.1g})" for p, text in failures[:3]] + (["..."] if len(failures) > 3 else [])
+    if n_failed > MOST_FAILED * (n + n_failed):
+        reasons.append(f"{n_failed} of {n + n_failed} frames have no posterior ({rows['message'][~good][0]})")
+    least = min(checks)[0] * len(checks)
+    message = "not calibrated: " + "; ".join(reasons) if reasons else (
+        f"calibrated: {n} frames, {len(pits)} quantities, {len(checks)} checks of which the least likely has a chance of "
+        f"{min(least, 1.0):.2g} among as many"
+    )  # fmt: skip
+    columns = {key: np.array([row[key] for row in table]) for key in table[0]}
+    return PosteriorCalibration(path, not reasons, message, n, n_failed, pits, columns)
+
+
+def _chance(z: float) -> float:
+    """p-value of a standard normal deviation to either side."""
+    return float(erfc(abs(z) / math.sqrt(2.0)))
