@@ -1,4 +1,5 @@
 from . import runs
+from .analysis.comparison import Comparison, compare
 from .analysis.diagnostics import Diagnostics, diagnose
 from .errors import InputError
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
@@ -17,6 +18,7 @@ from .inference.sampling import sample
 __all__ = [
     "BackgroundNoise",
     "Chain",
+    "Comparison",
     "Detector",
     "Diagnostics",
     "ForwardModel",
@@ -30,6 +32,7 @@ __all__ = [
     "PolynomialDistortion",
     "Posterior",
     "SourceCatalog",
+    "compare",
     "correct_sampling",
     "diagnose",
     "find_map",
