@@ -2,9 +2,9 @@
 
 A model is scored by elpd, the sum over pixels of log p(n_i | the other pixels). With draws theta_s of the whole frame's
 posterior, p(n_i | the others) is the harmonic mean of p(n_i | theta_s): leaving a pixel out weights the draws by
-1 / p(n_i | theta_s). A frame has so many pixels that hardly any weights differ: where all of a pixel's lie within a factor e^`SPREAD`
-their plain mean is known to a hundredth, and elsewhere their largest are replaced by those of a fitted Pareto distribution, whose
-shape says whether the weights can be trusted. Differences of elpd are judged by the scatter of the pixels' differences.
+1 / p(n_i | theta_s). A frame has so many pixels that hardly any weights differ: where all of a pixel's lie within a factor
+e^`SPREAD` their plain mean is known to a hundredth, and elsewhere their largest are replaced by those of a fitted Pareto
+distribution, whose shape says whether the weights can be trusted. Differences of elpd are judged by the scatter of the pixels' differences.
 
 References
 ----------
@@ -16,9 +16,10 @@ T. Sivula, M. Magnusson, A. Vehtari (2020), arXiv:2008.10296: what a difference 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from arviz_stats.base import array_stats
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
 from bayesfred.errors import InputError
@@ -29,6 +30,8 @@ from bayesfred.inference.posterior import Posterior
 __all__ = ["Comparison", "Score", "compare"]
 
 Floats = NDArray[np.float64]
+
+_loo: Any = array_stats.loo
 
 # Pixels whose log-likelihood varies by less over the draws need no smoothing.
 SPREAD = 0.5
@@ -141,19 +144,9 @@ def compare(chains: Mapping[str, Chain], *, draws: int = 400) -> Comparison:
     for name in ranked:
         each, p_loo, shape, n_unreliable = pointwise[name]
         behind = best - each
-        scores.append(
-            Score(
-                name,
-                posteriors[name].n_parameters,
-                elpd[name],
-                _error_of_sum(each),
-                p_loo,
-                float(np.sum(behind)),
-                _error_of_sum(behind),
-                shape,
-                n_unreliable,
-            )  # fmt: skip
-        )
+        difference = float(np.sum(behind)), _error_of_sum(behind)
+        count = posteriors[name].n_parameters
+        scores.append(Score(name, count, elpd[name], _error_of_sum(each), p_loo, *difference, shape, n_unreliable))
     good = [s for s in scores if s.difference <= max(NEGLIGIBLE, STANDARD_ERRORS * s.difference_se)]
     return Comparison(tuple(scores), min(good, key=lambda s: s.n_parameters).name)
 
@@ -187,7 +180,7 @@ def _leave_one_out(posterior: Posterior, chain: Chain, n_draws: int) -> tuple[Fl
         values = np.stack([value[part] for value in _log_likelihoods(posterior, draws)], axis=-1)
         if part.size:
             with np.errstate(all="ignore"):  # a tail of draws that are all alike has no shape: NaN, which is not reliable
-                elpd[part], shape[part], p = array_stats.loo(values, chain_axis=None, draw_axis=-1, r_eff=r_eff)
+                elpd[part], shape[part], p = _loo(values, chain_axis=None, draw_axis=-1, r_eff=r_eff)
             seen[part] = elpd[part] + p
     limit = min(1.0 - 1.0 / math.log10(len(draws)), 0.7)
     return elpd, float(np.sum(seen - elpd)), float(shape.max()), int(np.sum(~(shape <= limit)))

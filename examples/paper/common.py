@@ -147,7 +147,7 @@ def small(value: float) -> str:
 
 def same(paper: float, ours: float, sd: float, rounding: float = 0.0) -> bool:
     """Whether two measurements of the same kind, each with this standard deviation, agree within three of them."""
-    return abs(paper - ours) <= 3.0 * math.sqrt(2.0) * sd + rounding
+    return bool(abs(paper - ours) <= 3.0 * math.sqrt(2.0) * sd + rounding)
 
 
 # ------------------------------------------------------------------------------------------------------------------ pictures
