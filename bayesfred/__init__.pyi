@@ -6,7 +6,7 @@ from .imaging.detector import Detector, correct_sampling, sampling_matrix
 from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
-from .imaging.psf import GaussianPSF
+from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
 from .imaging.scene import SourceCatalog
 from .inference.chainfile import Chain, open_chain
 from .inference.estimate import MapEstimate, find_map
@@ -27,10 +27,12 @@ __all__ = [
     "LaplaceMove",
     "LogDistortion",
     "MapEstimate",
+    "MoffatPSF",
     "Nuisances",
     "PoissonNoise",
     "PolynomialDistortion",
     "Posterior",
+    "SampledPSF",
     "SourceCatalog",
     "compare",
     "correct_sampling",

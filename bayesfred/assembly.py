@@ -1,6 +1,5 @@
 """From the settings of a run file to the objects that they describe."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from bayesfred.errors import InputError, printable
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.imaging.psf import PSF, GaussianPSF, MoffatPSF, SampledPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference import priors
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
@@ -24,7 +23,7 @@ Floats = npt.NDArray[np.float64]
 STRAY = 0.3
 
 
-def catalogue(run: settings.RunSettings, run_file: Path, shape: tuple[int, int]) -> tuple[SourceCatalog, str]:
+def catalogue(run: settings.RunSettings, run_file: Path, shape: tuple[int, int], psf: PSF) -> tuple[SourceCatalog, str]:
     """The catalogue's sources whose light can reach the frame, and a line that counts them.
 
     A source is at the edge if the frame's border is within three widths of the PSF, or between it and the frame; and outside if
@@ -33,18 +32,33 @@ def catalogue(run: settings.RunSettings, run_file: Path, shape: tuple[int, int])
     c, path = run.catalogue, settings.resolve(run.catalogue.path, run_file, must_exist=True)
     record = files.read_catalogue(path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point)
     half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
-    tolerance = run.model.tolerance
-    reach = run.psf.sigma * math.sqrt(-2.0 * math.log(tolerance)) if tolerance > 0 else math.inf
     beyond = np.abs([record.x, record.y]) - half  # pixels, negative inside
-    outside = (beyond > reach + STRAY * half).any(axis=0)
+    outside = (beyond > psf.reach(run.model.tolerance) + STRAY * half).any(axis=0)
     kept = ~outside if not outside.all() else outside
-    at_edge = kept & (beyond > -3.0 * run.psf.sigma).any(axis=0)
+    at_edge = kept & (beyond > -3.0 * psf.sigma).any(axis=0)
     numbers = f"{len(record.x)} sources, {at_edge.sum()} at the frame's edge, {(~kept).sum()} outside left out"
     return SourceCatalog(record.x[kept], record.y[kept], record.flux[kept]), f"{printable(path.name)}: {numbers}"
 
 
-def forward_model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog) -> ForwardModel:
-    """The forward model of [detector], [psf], [distortion] and [model]."""
+def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
+    """The PSF of [psf]."""
+    p = run.psf
+    if p.sigma is not None:
+        return GaussianPSF(p.sigma)
+    if p.fwhm is not None and p.beta is not None:
+        return MoffatPSF(p.fwhm, p.beta)
+    path = settings.resolve(p.path or "", run_file, must_exist=True)
+    image = files.read_frame(path, gain=1.0)
+    if image.n_masked:
+        raise InputError(f"{path}: got {image.n_masked} pixels that are not finite, expected samples of a PSF: fill them first")
+    try:
+        return SampledPSF(image.counts, p.oversampling or 0.0)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def forward_model(run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog, psf: PSF) -> ForwardModel:
+    """The forward model of [detector], [distortion] and [model]."""
     d = run.distortion
     if d.terms is None:
         distortion = PolynomialDistortion(d.f_terms or (), d.g_terms or ())
@@ -54,9 +68,7 @@ def forward_model(run: settings.RunSettings, shape: tuple[int, int], sources: So
         distortion = getattr(PolynomialDistortion, d.terms)()
     detector = Detector(shape, binning=run.detector.binning, pixel=run.detector.pixel)
     m = run.model
-    return ForwardModel(
-        detector, sources, GaussianPSF(run.psf.sigma), distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance
-    )
+    return ForwardModel(detector, sources, psf, distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance)
 
 
 def noise_model(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
@@ -79,11 +91,12 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
     s = run.simulation
     assert s is not None, "checked by the callers"
     files.require_memory(f"{run_file}: simulation.shape", s.shape)
+    psf = reference_psf(run, run_file)
     if s.grid:
         sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)
     else:
-        sources, _ = catalogue(run, run_file, s.shape)
-    model = forward_model(run, s.shape, sources)
+        sources, _ = catalogue(run, run_file, s.shape, psf)
+    model = forward_model(run, s.shape, sources, psf)
     unknown = sorted(set(s.theta) - set(model.distortion.names))
     if unknown:
         raise InputError(

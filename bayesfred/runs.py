@@ -151,10 +151,12 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     frame = files.read_frame(path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name)
     print(frame.description)
     ny, nx = frame.counts.shape
-    sources, census = assembly.catalogue(run, run_file, (ny, nx))
+    psf = assembly.reference_psf(run, run_file)
+    sources, census = assembly.catalogue(run, run_file, (ny, nx), psf)
     print(census)
     with _naming(run_file):
-        posterior = assembly.posterior_given(run, assembly.forward_model(run, (ny, nx), sources), frame.counts, frame.valid)
+        model = assembly.forward_model(run, (ny, nx), sources, psf)
+        posterior = assembly.posterior_given(run, model, frame.counts, frame.valid)
     if run.output.path is None and not output.parent.is_dir():
         with _writing(output):
             output.parent.mkdir()

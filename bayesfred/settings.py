@@ -117,15 +117,38 @@ class DetectorSettings(_Section):
 
 
 class PSFSettings(_Section):
-    """`[psf]`: the reference PSF, a Gaussian.
+    """`[psf]`: the reference PSF, in pixels of the fine grid.
 
     Attributes
     ----------
+    kind : {'gaussian', 'moffat', 'sampled'}
+        Which of `GaussianPSF`, `MoffatPSF` and `SampledPSF` it is.
     sigma : float, pixel
-        Standard deviation, in pixels of the fine grid.
+        Of a Gaussian: standard deviation.
+    fwhm : float, pixel
+        Of a Moffat function: full width at half maximum.
+    beta : float
+        Exponent of its wings.
+    path : str
+        Of a sampled PSF: file of its samples, an image such as a frame's, its sides odd numbers of pixels.
+    oversampling : float
+        Samples per pixel.
     """
 
-    sigma: _Positive
+    kind: Literal["gaussian", "moffat", "sampled"] = "gaussian"
+    sigma: _Positive | None = None
+    fwhm: _Positive | None = None
+    beta: Annotated[float, Field(gt=1, le=100)] | None = None
+    path: _Name | None = None
+    oversampling: Annotated[float, Field(ge=1, le=1001)] | None = None
+
+    @model_validator(mode="after")
+    def _keys_of_the_kind(self) -> PSFSettings:
+        wanted = {"gaussian": ["sigma"], "moffat": ["fwhm", "beta"], "sampled": ["path", "oversampling"]}[self.kind]
+        given = [key for key in ("sigma", "fwhm", "beta", "path", "oversampling") if getattr(self, key) is not None]
+        if given != wanted:
+            raise ValueError(f"got {' and '.join(given) or 'no width'}, expected {' and '.join(wanted)} with kind = '{self.kind}'")
+        return self
 
 
 class DistortionSettings(_Section):
@@ -207,7 +230,7 @@ class NuisanceSettings(_Section):
     offset : bool
         Whether a common shift of all sources is fitted.
     psf_sigma : bool
-        Whether the PSF's width is fitted.
+        Whether the PSF's width is fitted, whatever its kind: that of the Gaussian as wide at half maximum.
     background_order : {0, 1, 2}
         Order of the background's polynomial over the frame.
     footprint : float, optional, pixel

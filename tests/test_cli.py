@@ -34,6 +34,7 @@ from bayesfred import assembly, files
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.cli import app
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.chainfile import Chain, open_chain
 from bayesfred.inference.estimate import find_map
@@ -675,7 +676,8 @@ def test_what_is_left_out_as_outside_changes_no_pixel(simulated: Path) -> None:
 
 
 def open_model(run: RunSettings, x: float) -> ForwardModel:
-    return assembly.forward_model(run, (60, 75), SourceCatalog(np.array([x]), np.array([0.0]), np.array([5e3])))
+    sources = SourceCatalog(np.array([x]), np.array([0.0]), np.array([5e3]))
+    return assembly.forward_model(run, (60, 75), sources, GaussianPSF(2.5))
 
 
 def test_zero_background(folder: Path) -> None:

@@ -52,7 +52,7 @@ def test_defaults(tmp_path: Path) -> None:
         "frame": {"path": "frame.fits", "pedestal": 0.0},
         "catalogue": {"path": "stars.csv", "x": "x", "y": "y", "flux": "flux"},
         "detector": {"pixel": "impulse", "binning": 1},
-        "psf": {"sigma": 2.0},
+        "psf": {"kind": "gaussian", "sigma": 2.0},
         "distortion": {"terms": "mirrored"},
         "model": {"conserve_flux": True, "tolerance": 1e-8},
         "noise": {"kind": "poisson", "read_noise": 0.0},
@@ -133,7 +133,7 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "psf",
             "sigma = 2\nqqq = 1",
-            "psf.qqq: unknown key, expected one of sigma",
+            "psf.qqq: unknown key, expected one of beta, fwhm, kind, oversampling, path, sigma",
         ),
         ("psf", "sigma = -1.5", "psf.sigma: got -1.5, expected a number greater than 0"),
         (

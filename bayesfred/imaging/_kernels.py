@@ -7,8 +7,9 @@ For one source the displacement is a polynomial in (u, v) alone, so the kernel's
 are two small coefficient matrices. They are expanded about the source's peak, where a = b = 0, which makes
 them well conditioned and gives the window of pixels to visit. So are a^2 + b^2 and the Jacobian determinant
 D = a_u b_v - a_v b_u, multiplied out once per source. Along a row of pixels they are polynomials in u alone: a sample of
-the kernel costs two Horner sweeps and one exponential. The degree in u reaches the innermost loop as the length of a
-tuple, that is as a compile-time constant, so that the loop over pixels vectorises for every degree.
+a Gaussian's kernel costs two Horner sweeps and one exponential. The degree in u reaches the innermost loop as the length of a
+tuple, that is as a compile-time constant, so that the loop over pixels vectorises for every degree. So does the kind of the PSF,
+as a type: what is compiled holds the code of one kind alone.
 
 `forward.py` binds these functions to the public objects; the loops over counts are in `inference/_kernels.py`.
 """
@@ -21,7 +22,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -40,9 +41,35 @@ BATCH = 32  # sources whose rows are listed at a time: of many sources the list 
 SEGMENT = 16  # pixels that are marked together as reached by a source
 
 
+class Gaussian(NamedTuple):
+    """norm exp(-(a^2 + b^2) / 2). Here and below, a and b in units of sigma."""
+
+    norm: float
+
+
+class Moffat(NamedTuple):
+    """norm (1 + (a^2 + b^2) / square)^-beta."""
+
+    norm: float
+    square: float
+    beta: float
+
+
+class Spline(NamedTuple):
+    """norm times the sum of c[j, i] B(y - j) B(x - i), B the cubic B-spline; from the middle, x = a / pitch and y = b / pitch.
+
+    The four outermost rows and columns of c are zero.
+    """
+
+    norm: float
+    c: Floats
+    pitch: float
+
+
 class Optics(NamedTuple):
     """A forward model as the loops need it; s counts sources, k terms."""
 
+    psf: Gaussian | Moffat | Spline
     x: Floats  # (s,) pixel
     y: Floats
     f_powers: Ints  # (k, 2) powers of u and v
@@ -54,7 +81,7 @@ class Optics(NamedTuple):
     step: float  # pitch of the recorded pixels in fine pixels
     ny: int
     nx: int
-    cut: float  # -2 log(tolerance)
+    reach: float  # (a, b) that lie farther from 0 are below the tolerance, sigma
     ramp: Floats  # (padded row,) u of pixels counted from a row's first
     degree: tuple[int, ...]  # its length is the degree of a and b in u or v, whichever is higher
     q_degree: tuple[int, ...]  # of a^2 + b^2
@@ -131,6 +158,28 @@ def exp2(x):
     p = p * f + 6.9314718055994533046e-01
     p = p * f + 1.0
     return as_float(as_bits(p) + (as_bits(shifted) << 52))
+
+
+@nb.njit(fastmath=FAST, inline="always")
+def log(x):
+    """log(x) of a positive normal number to 3e-16 (absolute near 1).
+
+    The mantissa m in [0.7, 1.41] by bits, then 2 artanh(s) with s = (m - 1) / (m + 1): 2 s + 2 s^3 p(s^2), p being the polynomial
+    of degree 6 nearest to 1/3 + z/5 + z^2/7 + ... (Remez, 5e-18 of the result).
+    """
+    bits = as_bits(x)
+    k = (bits - 4604544271217802189) >> 52  # exponent, counted from sqrt(1/2)
+    m = as_float(bits - (k << 52))
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    p = 7.3089406919315180756e-02
+    p = p * z + 7.6657981172986236734e-02
+    p = p * z + 9.0914466202426646721e-02
+    p = p * z + 1.1111105536283593608e-01
+    p = p * z + 1.4285714313200197706e-01
+    p = p * z + 1.9999999999949222791e-01
+    p = p * z + 3.3333333333333348644e-01
+    return k * 6.93147180369123816490e-01 + (2.0 * s + (2.0 * s * z * p + k * 1.90821492927058770002e-10))
 
 
 @inner(cache=True)
@@ -271,7 +320,7 @@ def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
     Windows hold the pixels above the tolerance, and those above it once a source moves by up to `margin` in (a, b).
     """
     unfolded = True
-    radius = sigma * math.sqrt(o.cut) + margin
+    radius = sigma * o.reach + margin
     bounds = np.empty(2 * len(o.degree) + 1)
     for s in range(o.x.size):
         a = maps.a[s]
@@ -370,36 +419,230 @@ def row_starts(fp, pitch):
     return at
 
 
+# --- the PSF ----------------------------------------------------------------------------------------------------------
+#
+# What the loops ask of a PSF of width sigma, norm / sigma^2 left out: `_arguments` fills a row's polynomials, from which `_value`
+# makes p at t; from a and b `_slopes` makes p, -p_a and -p_b, and `_bends` -p_a, -p_b, p_aa, p_ab and p_bb.
+
+
+def of_kind(gaussian: Any, moffat: Any, spline: Any) -> Any:
+    """A function that is compiled, into its caller, as the one for the kind of PSF that is its first argument."""
+    kinds = {Gaussian: gaussian, Moffat: moffat, Spline: spline}
+
+    def function(psf: Any, *arguments: Any) -> Any:
+        raise NotImplementedError("for compiled code")
+
+    @overload(function, inline="always", strict=False)
+    def choose(psf: Any, *arguments: Any) -> Any:
+        return kinds[psf.instance_class]
+
+    return function
+
+
+def _gaussian_arguments(psf, maps, s, w, sigma, work, degree, q_degree):
+    _along(maps.q[s], w, -0.5 * LOG2_E / (sigma * sigma), work[0], q_degree)
+
+
+def _moffat_arguments(psf, maps, s, w, sigma, work, degree, q_degree):
+    _along(maps.q[s], w, 1.0 / (psf.square * sigma * sigma), work[0], q_degree)
+    work[0, 0] += 1.0
+
+
+def _spline_arguments(psf, maps, s, w, sigma, work, degree, q_degree):
+    _row(maps.a[s], maps.b[s], w, work[0], work[2], work[3], work[4], degree)
+    for m in range(len(degree) + 1):
+        work[0, m] /= psf.pitch * sigma
+        work[2, m] /= psf.pitch * sigma
+
+
+def _gaussian_value(psf, t, r, r2, degree, q_degree):
+    top = len(q_degree)
+    e = r[top]
+    for m in range(top):
+        e = e * t + r[top - 1 - m]
+    return exp2(e)
+
+
+def _moffat_value(psf, t, r, r2, degree, q_degree):
+    top = len(q_degree)
+    e = r[top]
+    for m in range(top):
+        e = e * t + r[top - 1 - m]
+    return exp2(-LOG2_E * psf.beta * log(e))
+
+
+def _spline_value(psf, t, r, r2, degree, q_degree):
+    top = len(degree)
+    x, y = r[top], r2[top]
+    for m in range(top):
+        x = x * t + r[top - 1 - m]
+        y = y * t + r2[top - 1 - m]
+    i, x = _cell(psf.c.shape[1], x)
+    j, y = _cell(psf.c.shape[0], y)
+    w0, w1, w2, w3 = _weights(x)
+    v0, v1, v2, v3 = _weights(y)
+    r0, r1, r2, r3 = _four(psf.c, j, i, w0, w1, w2, w3)
+    return v0 * r0 + v1 * r1 + v2 * r2 + v3 * r3
+
+
+@nb.njit(inline="always")
+def _cell(size, x):
+    """The first of the four coefficients that matter at x samples from their middle, and where between the middle two x is.
+
+    Beyond the outermost coefficients the spline is zero, as it is among the last four.
+    """
+    x = min(max(x + 0.5 * (size - 1), 1.0), size - 2.5)
+    i = np.int64(x)
+    return i - 1, x - i
+
+
+@nb.njit(inline="always")
+def _weights(f):
+    """The B-splines of four neighbouring samples, f of a step after the second."""
+    g = 1.0 - f
+    return g * g * g / 6.0, 2.0 / 3.0 - f * f * (1.0 - 0.5 * f), 2.0 / 3.0 - g * g * (1.0 - 0.5 * g), f * f * f / 6.0
+
+
+@nb.njit(inline="always")
+def _slope_weights(f):
+    g = 1.0 - f
+    return -0.5 * g * g, f * (1.5 * f - 2.0), -g * (1.5 * g - 2.0), 0.5 * f * f
+
+
+@nb.njit(inline="always")
+def _bend_weights(f):
+    g = 1.0 - f
+    return g, 3.0 * f - 2.0, 3.0 * g - 2.0, f
+
+
+@nb.njit(inline="always")
+def _four(c, j, i, w0, w1, w2, w3):
+    """The weighted sums of four coefficients on four rows."""
+    return (
+        w0 * c[j, i] + w1 * c[j, i + 1] + w2 * c[j, i + 2] + w3 * c[j, i + 3],
+        w0 * c[j + 1, i] + w1 * c[j + 1, i + 1] + w2 * c[j + 1, i + 2] + w3 * c[j + 1, i + 3],
+        w0 * c[j + 2, i] + w1 * c[j + 2, i + 1] + w2 * c[j + 2, i + 2] + w3 * c[j + 2, i + 3],
+        w0 * c[j + 3, i] + w1 * c[j + 3, i + 1] + w2 * c[j + 3, i + 2] + w3 * c[j + 3, i + 3],
+    )
+
+
+# A Gaussian and a Moffat alike have p_a = -a w p and p_aa = w (kappa w a^2 - 1) p, with w = 1 / sigma^2 and kappa = 1, or
+# w = 2 beta / (square sigma^2 + a^2 + b^2) and kappa = 1 + 1 / beta.
+
+
+@nb.njit(inline="always")
+def _gaussian_radial(psf, sigma, a, b):
+    inverse = 1.0 / (sigma * sigma)
+    return exp2(-0.5 * LOG2_E * inverse * (a * a + b * b)), inverse, 1.0
+
+
+@nb.njit(inline="always")
+def _moffat_radial(psf, sigma, a, b):
+    core = psf.square * sigma * sigma
+    z = 1.0 / core * (a * a + b * b) + 1.0
+    return exp2(-LOG2_E * psf.beta * log(z)), 2.0 * psf.beta / (core * z), 1.0 + 1.0 / psf.beta
+
+
+@nb.njit(inline="always")
+def _radial_bends(p, w, kappa, a, b):
+    k = w * p
+    h = kappa * w * k
+    return k * a, k * b, h * a * a - k, h * a * b, h * b * b - k
+
+
+def _gaussian_slopes(psf, sigma, a, b):
+    p, w, _ = _gaussian_radial(psf, sigma, a, b)
+    return p, w * p * a, w * p * b
+
+
+def _moffat_slopes(psf, sigma, a, b):
+    p, w, _ = _moffat_radial(psf, sigma, a, b)
+    return p, w * p * a, w * p * b
+
+
+def _spline_slopes(psf, sigma, a, b):
+    k = 1.0 / (psf.pitch * sigma)
+    i, x = _cell(psf.c.shape[1], k * a)
+    j, y = _cell(psf.c.shape[0], k * b)
+    w0, w1, w2, w3 = _weights(x)
+    d0, d1, d2, d3 = _slope_weights(x)
+    v0, v1, v2, v3 = _weights(y)
+    e0, e1, e2, e3 = _slope_weights(y)
+    r0, r1, r2, r3 = _four(psf.c, j, i, w0, w1, w2, w3)
+    s0, s1, s2, s3 = _four(psf.c, j, i, d0, d1, d2, d3)
+    return (
+        v0 * r0 + v1 * r1 + v2 * r2 + v3 * r3,
+        -k * (v0 * s0 + v1 * s1 + v2 * s2 + v3 * s3),
+        -k * (e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3),
+    )
+
+
+def _gaussian_bends(psf, sigma, a, b):
+    p, w, kappa = _gaussian_radial(psf, sigma, a, b)
+    return _radial_bends(p, w, kappa, a, b)
+
+
+def _moffat_bends(psf, sigma, a, b):
+    p, w, kappa = _moffat_radial(psf, sigma, a, b)
+    return _radial_bends(p, w, kappa, a, b)
+
+
+def _spline_bends(psf, sigma, a, b):
+    k = 1.0 / (psf.pitch * sigma)
+    i, x = _cell(psf.c.shape[1], k * a)
+    j, y = _cell(psf.c.shape[0], k * b)
+    w0, w1, w2, w3 = _weights(x)
+    d0, d1, d2, d3 = _slope_weights(x)
+    h0, h1, h2, h3 = _bend_weights(x)
+    v0, v1, v2, v3 = _weights(y)
+    e0, e1, e2, e3 = _slope_weights(y)
+    g0, g1, g2, g3 = _bend_weights(y)
+    r0, r1, r2, r3 = _four(psf.c, j, i, w0, w1, w2, w3)
+    s0, s1, s2, s3 = _four(psf.c, j, i, d0, d1, d2, d3)
+    q0, q1, q2, q3 = _four(psf.c, j, i, h0, h1, h2, h3)
+    return (
+        -k * (v0 * s0 + v1 * s1 + v2 * s2 + v3 * s3),
+        -k * (e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3),
+        k * k * (v0 * q0 + v1 * q1 + v2 * q2 + v3 * q3),
+        k * k * (e0 * s0 + e1 * s1 + e2 * s2 + e3 * s3),
+        k * k * (g0 * r0 + g1 * r1 + g2 * r2 + g3 * r3),
+    )
+
+
+_arguments = of_kind(_gaussian_arguments, _moffat_arguments, _spline_arguments)
+_value = of_kind(_gaussian_value, _moffat_value, _spline_value)
+_slopes = of_kind(_gaussian_slopes, _moffat_slopes, _spline_slopes)
+_bends = of_kind(_gaussian_bends, _moffat_bends, _spline_bends)
+
+# ----------------------------------------------------------------------------------------------------------------------
+
+
 @inner(cache=True, fastmath=FAST, error_model="numpy")
 def add_source(o, maps, fp, s, sigma, flux, at, out, work):
     """Add source s to `out`, the samples of row i from at[i] on."""
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this function: a call costs more
     # than a short row.
-    q, d, u, v = maps.q[s], maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
+    d, u, v = maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
     offsets, weights, step, lows, rows, sizes = o.offsets, o.weights, o.step, fp.low, fp.row, fp.size
     middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
-    rq, rd, ramp = work[0], work[1], o.ramp
-    q_top, d_top = len(o.q_degree), len(o.d_degree)
-    k = -0.5 * LOG2_E / (sigma * sigma)
-    norm = flux / (2.0 * math.pi * sigma * sigma)
+    r, rd, r2, ramp, psf = work[0], work[1], work[2], o.ramp, o.psf
+    d_top = len(o.d_degree)
+    norm = flux * psf.norm / (sigma * sigma)
     for i in range(fp.first[s], fp.first[s + 1]):
         w = (rows[i] - middle_v) * step - v
         t_low = (lows[i] - middle_u) * step - u
         row = out[at[i] : at[i] + sizes[i]]
         for y in range(offsets.size):
-            _along(q, w + offsets[y], k, rq, o.q_degree)
+            _arguments(psf, maps, s, w + offsets[y], sigma, work, o.degree, o.q_degree)
             for x in range(offsets.size):
                 _along(d, w + offsets[y], norm * weights[y] * weights[x], rd, o.d_degree)
                 t0 = t_low + offsets[x]
                 for n in range(row.size):
                     t = t0 + ramp[n]
-                    e = rq[q_top]
-                    for m in range(q_top):
-                        e = e * t + rq[q_top - 1 - m]
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
-                    row[n] += exp2(e) * abs(j)
+                    row[n] += _value(psf, t, r, r2, o.degree, o.q_degree) * abs(j)
 
 
 @inner(cache=True)
@@ -412,29 +655,24 @@ def move(o, maps, s, by_x, by_y):
 
 @inner(cache=True, fastmath=FAST, error_model="numpy")
 def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
-    """Like `add_source` at unit flux, and F X and F Y beside it: X = a K / sigma^2 is K's derivative as s moves along a."""
+    """Like `add_source` at unit flux, and F X and F Y beside it: X = -p_a |D| is K's derivative as s moves along a."""
     u, v = maps.peak[s, 0], maps.peak[s, 1]
     offsets, weights, step, ramp = o.offsets, o.weights, o.step, o.ramp
-    rq, rd, ra, rb, rav, rbv = work[0], work[1], work[2], work[3], work[4], work[5]
-    q_top, d_top, top = len(o.q_degree), len(o.d_degree), len(o.degree)
-    inverse = 1.0 / (sigma * sigma)
+    rd, ra, rb, rav, rbv = work[1], work[2], work[3], work[4], work[5]
+    d_top, top = len(o.d_degree), len(o.degree)
     for i in range(fp.first[s], fp.first[s + 1]):
         w = (fp.row[i] - 0.5 * (o.ny - 1)) * step - v
         t_low = (fp.low[i] - 0.5 * (o.nx - 1)) * step - u
         first, last = fp.start[i], fp.start[i + 1]
         row, row_a, row_b = image[first:last], along[first:last], across[first:last]
         for y in range(offsets.size):
-            _along(maps.q[s], w + offsets[y], -0.5 * LOG2_E * inverse, rq, o.q_degree)
             _row(maps.a[s], maps.b[s], w + offsets[y], ra, rb, rav, rbv, o.degree)
             for x in range(offsets.size):
-                weight = weights[y] * weights[x] * inverse / (2.0 * math.pi)
+                weight = weights[y] * weights[x] * o.psf.norm / (sigma * sigma)
                 _along(maps.d[s], w + offsets[y], weight, rd, o.d_degree)
                 t0 = t_low + offsets[x]
                 for n in range(row.size):
                     t = t0 + ramp[n]
-                    e = rq[q_top]
-                    for m in range(q_top):
-                        e = e * t + rq[q_top - 1 - m]
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
@@ -442,10 +680,10 @@ def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
                     for m in range(top):
                         a = a * t + ra[top - 1 - m]
                         b = b * t + rb[top - 1 - m]
-                    k = exp2(e) * abs(j)
-                    row[n] += k
-                    row_a[n] += flux * inverse * k * a
-                    row_b[n] += flux * inverse * k * b
+                    k, k_a, k_b = _slopes(o.psf, sigma, a, b)
+                    row[n] += k * abs(j)
+                    row_a[n] += flux * k_a * abs(j)
+                    row_b[n] += flux * k_b * abs(j)
 
 
 @inner(cache=True)
@@ -503,15 +741,15 @@ class Basis(NamedTuple):
 
 
 @nb.njit(inline="always")
-def _exponential_row(out, ramp, t0, rq, weight, q_degree):
-    """out[i] = weight 2^q(t) at t = t0 + ramp[i]."""
-    top = len(q_degree)
+def _polynomial_row(out, ramp, t0, coefficients, degree):
+    """out[i] = a polynomial at t = t0 + ramp[i]."""
+    top = len(degree)
     for i in range(out.size):
         t = t0 + ramp[i]
-        q = rq[top]
+        p = coefficients[top]
         for m in range(top):
-            q = q * t + rq[top - 1 - m]
-        out[i] = weight * exp2(q)
+            p = p * t + coefficients[top - 1 - m]
+        out[i] = p
 
 
 @nb.njit(inline="always")
@@ -527,26 +765,48 @@ def _times_polynomial(out, source, factor, ramp, t0, coefficients, degree):
 
 
 @nb.njit(inline="always")
-def _absolute_and_sign(absolute, signed, source):
-    """absolute = |source * signed|, signed = |source| times the sign of their product."""
-    for i in range(source.size):
-        d = signed[i]
-        e = source[i]
-        absolute[i] = abs(d)
-        signed[i] = e if d > 0.0 else -e
+def _slopes_row(psf, sigma, weight, p, a, b):
+    """From a and b to weight times p, p_a and p_b."""
+    for i in range(p.size):
+        k, x, y = _slopes(psf, sigma, a[i], b[i])
+        p[i], a[i], b[i] = weight * k, -weight * x, -weight * y
 
 
 @nb.njit(inline="always")
-def _to_shift(along, across, size, signed, inverse):
-    """From the samples of p to those of a p / sigma^2, where `along` holds p_a |D| and `across` p_b |D|."""
-    for i in range(size.size):
-        k = size[i]
-        x = -along[i] / k if k > 0.0 else 0.0
-        y = -across[i] / k if k > 0.0 else 0.0
-        along[i] = k * (inverse - x * x)
-        across[i] = -k * x * y
-        size[i] = k * x
-        signed[i] *= x
+def _bends_row(psf, sigma, weight, along_a, p, a, b):
+    """The same for -p_a, or for -p_b, in place of p."""
+    for i in range(p.size):
+        x, y, xx, xy, yy = _bends(psf, sigma, a[i], b[i])
+        p[i] = weight * (x if along_a else y)
+        a[i], b[i] = -weight * (xx if along_a else xy), -weight * (xy if along_a else yy)
+
+
+@nb.njit(inline="always")
+def _times_determinant(p, size, signed):
+    """From D in `signed` to size = p |D| and p sign(D)."""
+    for i in range(p.size):
+        size[i] = p[i] * abs(signed[i])
+        signed[i] = p[i] if signed[i] > 0.0 else -p[i]
+
+
+@nb.njit(inline="always")
+def _times_absolute(a, b, d):
+    for i in range(d.size):
+        a[i] *= abs(d[i])
+        b[i] *= abs(d[i])
+
+
+@nb.njit(inline="always")
+def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, degree):
+    """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma, P being homogeneous of degree -order in a, b and sigma."""
+    top = len(degree)
+    for i in range(out.size):
+        t = t0 + ramp[i]
+        a, b = ra[top], rb[top]
+        for m in range(top):
+            a = a * t + ra[top - 1 - m]
+            b = b * t + rb[top - 1 - m]
+        out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) / sigma
 
 
 @nb.njit(inline="always")
@@ -588,45 +848,43 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
     An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term changes
-    b, hence p by p_b B and D by B_v a_u - B_u a_v. With E = weight p and s = sign(D) the rows of `samples` are E, E |D|, s E,
-    p_a |D|, p_b |D|, s E b_v, -s E b_u, -s E a_v, s E a_u.
+    b, hence p by p_b B and D by B_v a_u - B_u a_v. With P = weight p and s = sign(D) the rows of `samples` are P, P |D|, s P,
+    P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u.
 
     Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is shifted along a and along b,
-    X = -p_a |D| and Y = -p_b |D|: the same with p replaced by a p / sigma^2 or b p / sigma^2.
+    X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or by -p_b. The number comes as an np.int64: of a literal one
+    this function would be compiled anew.
     """
-    ra, rb, rav, rbv, rq, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    ra, rb, rav, rbv, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5]
     ramp, conserve = o.ramp, len(o.d_degree) > 0
     n_f, n_g = basis.f.shape[0], basis.g.shape[0]
     for k in range(out.shape[0]):
         out[k, :n] = 0.0
-    k = -0.5 * LOG2_E / (sigma * sigma)
-    inverse = 1.0 / (sigma * sigma)
-    order = 1.0 if template == 0 else 2.0
-    norm = inverse / (2.0 * math.pi)
+    order = 2.0 if template == 0 else 3.0
     v_row = (j - 0.5 * (o.ny - 1)) * o.step
     u_row = (low - 0.5 * (o.nx - 1)) * o.step
     e, size, signed, along_a, along_b = samples[0, :n], samples[1, :n], samples[2, :n], samples[3, :n], samples[4, :n]
     f_u, f_v, g_u, g_v = samples[5, :n], samples[6, :n], samples[7, :n], samples[8, :n]
-    row_k, row_s = out[n_f + n_g], out[n_f + n_g + 1]
+    row_k, row_s = out[n_f + n_g, :n], out[n_f + n_g + 1, :n]
     top = len(o.degree)
     slope[:] = 0.0
     for q in range(o.offsets.size):
         v = v_row + o.offsets[q]
         _row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.degree)
-        _along(maps.q[s], v - maps.peak[s, 1], k, rq, o.q_degree)
         _along(maps.d[s], v - maps.peak[s, 1], 1.0, rd, o.d_degree)
         for p in range(o.offsets.size):
             u = u_row + o.offsets[p]
             t = u - maps.peak[s, 0]
-            _exponential_row(e, ramp, t, rq, norm * o.weights[q] * o.weights[p], o.q_degree)
-            _times_polynomial(signed, e, 1.0, ramp, t, rd, o.d_degree)
-            _absolute_and_sign(size, signed, e)
-            _times_polynomial(along_a, size, -inverse, ramp, t, ra, o.degree)
-            _times_polynomial(along_b, size, -inverse, ramp, t, rb, o.degree)
-            if template == 1:
-                _to_shift(along_a, along_b, size, signed, inverse)
-            elif template == 2:
-                _to_shift(along_b, along_a, size, signed, inverse)
+            weight = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
+            _polynomial_row(along_a, ramp, t, ra, o.degree)
+            _polynomial_row(along_b, ramp, t, rb, o.degree)
+            if template == 0:
+                _slopes_row(o.psf, sigma, weight, e, along_a, along_b)
+            else:
+                _bends_row(o.psf, sigma, weight, template == 1, e, along_a, along_b)
+            _polynomial_row(signed, ramp, t, rd, o.d_degree)
+            _times_absolute(along_a, along_b, signed)
+            _times_determinant(e, size, signed)
             if conserve:
                 _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
                 _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.degree)
@@ -639,11 +897,7 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             else:
                 samples[5:] = 0.0
             _add_row_of(row_k, size)
-            # dK/dsigma = K ((a^2 + b^2) / sigma^2 - 2) / sigma, and a^2 + b^2 = q / k; for X and Y, - 4 in place of - 2
-            rq[0] += order * LOG2_E
-            _times_polynomial(e, size, -2.0 / (LOG2_E * sigma), ramp, t, rq, o.q_degree)
-            rq[0] -= order * LOG2_E
-            _add_row_of(row_s, e)
+            _add_widening(row_s, size, order, along_a, along_b, sigma, ramp, t, ra, rb, o.degree)
             _powers_row(powers, ramp, u, n)
             _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
@@ -664,7 +918,7 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
             j, low, n = fp.row[p], fp.low[p], fp.size[p]
             if not first <= j < last:
                 continue
-            basis_row(o, maps, basis, s, j, low, n, sigma, 0, rows, samples, powers, work)
+            basis_row(o, maps, basis, s, j, low, n, sigma, np.int64(0), rows, samples, powers, work)
             for k in range(basis.row.size):
                 c = flux[s] * basis.lever[s, k]
                 if c != 0.0:

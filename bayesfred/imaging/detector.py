@@ -104,7 +104,7 @@ class Detector:
         ny, nx = self.shape
         return _centred(nx) * self.binning, _centred(ny) * self.binning
 
-    def quadrature(self, sigma: float) -> tuple[FloatArray, FloatArray]:
+    def quadrature(self, sigma: float, beta: float = math.inf) -> tuple[FloatArray, FloatArray]:
         """Points and weights along one axis whose sum gives a recorded pixel; the same rule serves both axes.
 
         Parameters
@@ -112,6 +112,8 @@ class Detector:
         sigma : float, fine pixel
             Width (Gaussian standard deviation) of the narrowest structure that the PSF has; `box` chooses the
             number of points by it.
+        beta : float
+            Exponent of a Moffat function, if it is one whose peak is curved like this Gaussian's.
 
         Returns
         -------
@@ -135,7 +137,7 @@ class Detector:
             raise InputError(f"sigma: got {sigma!r}, expected a finite number of pixels > 0")
         if self.pixel == "impulse":
             return _centred(self.binning), np.ones(self.binning)
-        nodes, weights = np.polynomial.legendre.leggauss(_box_order(self.binning / sigma))
+        nodes, weights = np.polynomial.legendre.leggauss(_box_order(self.binning / sigma, beta))
         half = self.binning / 2.0
         return np.asarray(nodes * half, dtype=np.float64), np.asarray(weights * half, dtype=np.float64)
 
@@ -157,8 +159,8 @@ def _centred(n: int) -> FloatArray:
     return np.asarray(np.arange(n) - (n - 1) / 2.0, dtype=np.float64)
 
 
-def _box_order(width: float) -> int:
-    """Smallest Gauss-Legendre order q that integrates a Gaussian over `width` sigma to BOX_TOLERANCE.
+def _box_order(width: float, beta: float) -> int:
+    """Smallest Gauss-Legendre order q that integrates a Gaussian, or a Moffat, over `width` sigma to BOX_TOLERANCE.
 
     Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some point of it.
     The even derivatives of F = exp(-x^2 / 2 s^2) are largest at x = 0 (its Fourier transform is positive),
@@ -166,6 +168,9 @@ def _box_order(width: float) -> int:
 
         e_q = (h/s)^(2q) (q!)^3 / ((2q+1) ((2q)!)^2 2^q),   e_0 = 1,
         e_q / e_(q-1) = (h/s)^2 q / (8 (4q^2 - 1)).
+
+    Those of a Moffat, F = (1 + x^2 / 2 beta s^2)^-beta, are largest there for the same reason: (2q)! / q! times
+    beta (beta + 1) ... (beta + q - 1) / (2 beta s^2)^q. So every step of e_q has a factor 1 + (q - 1) / beta.
 
     Distortion that narrows a spot by a factor c multiplies e_q by c^(2q).
     """
@@ -177,7 +182,7 @@ def _box_order(width: float) -> int:
                 f"psf: sigma: got pixels of {width:.3g} sigma with pixel = 'box', expected few enough to integrate over with "
                 f"{MOST_POINTS} points a side: widen the PSF or bin less"
             )
-        bound *= width * width * order / (8.0 * (4 * order**2 - 1))
+        bound *= width * width * order * (1.0 + (order - 1) / beta) / (8.0 * (4 * order**2 - 1))
     return order
 
 

@@ -21,7 +21,7 @@ from bayesfred.imaging import _kernels
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.logarithm import LogDistortion
-from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.imaging.psf import FWHM, PSF, read_psf
 from bayesfred.imaging.scene import SourceCatalog
 
 Floats = npt.NDArray[np.float64]
@@ -40,7 +40,7 @@ class ForwardModel:
         Geometry and pixel response of the recorded frame.
     sources : SourceCatalog
         Positions (pixel) and fluxes (counts) in the object plane.
-    psf : GaussianPSF
+    psf : GaussianPSF, MoffatPSF or SampledPSF
         Reference PSF at the axis.
     distortion : PolynomialDistortion or LogDistortion
         The terms of f and g. What is not polynomial can be simulated, not fitted: it has expected counts alone.
@@ -72,7 +72,7 @@ class ForwardModel:
 
     detector: Detector
     sources: SourceCatalog
-    psf: GaussianPSF
+    psf: PSF
     distortion: PolynomialDistortion | LogDistortion
     conserve_flux: bool = field(default=True, kw_only=True)
     tolerance: float = field(default=1e-8, kw_only=True)
@@ -82,12 +82,13 @@ class ForwardModel:
             raise InputError(f"model: tolerance: got {self.tolerance}, expected 0 <= tolerance < 1")
         if self.detector.pixel == "impulse" and self.psf.sigma < NARROWEST_IMPULSE:
             raise InputError(
-                f"psf: sigma: got {self.psf.sigma} pixel with pixel = 'impulse', narrower than the pixel: expected at least "
-                f"{NARROWEST_IMPULSE:.2f}, below which sampled flux depends on the sub-pixel position; use pixel = 'box'"
+                f"psf: sigma: got {self.psf.sigma:.4g} pixel with pixel = 'impulse', narrower than the pixel: expected at least "
+                f"{NARROWEST_IMPULSE:.2f} (a FWHM of {NARROWEST_IMPULSE * FWHM:.1f}), below which sampled flux depends on the "
+                "sub-pixel position; use pixel = 'box'"
             )
 
     def optics(self, narrowest: float | None = None) -> _kernels.Optics:
-        """The model as the compiled loops need it, with pixels integrated well for PSFs down to `narrowest` (pixel)."""
+        """The model as the compiled loops need it, with pixels integrated well for PSFs of widths down to `narrowest` (pixel)."""
         if isinstance(self.distortion, LogDistortion):
             raise InputError("distortion: got LogDistortion, expected PolynomialDistortion: what is not polynomial is not fitted")
         f = np.array(self.distortion.f_terms, dtype=np.int64).reshape(-1, 4)
@@ -95,8 +96,10 @@ class ForwardModel:
         degree = max(1, int(np.concatenate([f, g])[:, 2:].max()))
         x, y = self.sources.x[:, None], self.sources.y[:, None]
         ny, nx = self.detector.shape
-        offsets, weights = self.detector.quadrature(self.psf.sigma if narrowest is None else narrowest)
+        width, beta = self.psf.core
+        offsets, weights = self.detector.quadrature(width if narrowest is None else width * narrowest / self.psf.sigma, beta)
         return _kernels.Optics(
+            psf=self.psf.profile,
             x=self.sources.x,
             y=self.sources.y,
             f_powers=f[:, 2:].copy(),
@@ -108,7 +111,7 @@ class ForwardModel:
             step=float(self.detector.binning),
             ny=ny,
             nx=nx,
-            cut=-2.0 * math.log(self.tolerance) if self.tolerance > 0 else math.inf,
+            reach=self.psf.reach(self.tolerance) / self.psf.sigma,
             ramp=self.detector.binning * np.arange(_kernels.stride(nx), dtype=np.float64),
             degree=(0,) * degree,
             q_degree=(0,) * (2 * degree),
@@ -169,13 +172,13 @@ class ForwardModel:
 
     def _every_pixel(self) -> Floats:
         """The sources' image without compiled loops: every pixel for every source, any distortion."""
-        offsets, weights = self.detector.quadrature(self.psf.sigma)
+        offsets, weights = self.detector.quadrature(*self.psf.core)
         u, v = (np.add.outer(centres, offsets) for centres in self.detector.pixel_centres())
-        u, v, width = u[None, None], v[:, :, None, None], self.psf.sigma
+        u, v = u[None, None], v[:, :, None, None]
         out = np.zeros(self.detector.shape)
         for x, y, flux in zip(self.sources.x, self.sources.y, self.sources.flux, strict=True):
             f, g = self.distortion.displacement((), u, v, x, y)
-            kernel = flux * self.psf.peak * np.exp(-0.5 * ((u - x + f) ** 2 + (v - y + g) ** 2) / width**2)
+            kernel = flux * self.psf.density(u - x + f, v - y + g)
             if self.conserve_flux:
                 kernel *= np.abs(self.distortion.determinant((), u, v, x, y))
             out += np.einsum("jqip,q,p->ji", kernel, weights, weights, optimize=True)
@@ -221,7 +224,7 @@ class ForwardModel:
         return cls(
             Detector.read(group["detector"]),
             SourceCatalog.read(group["sources"]),
-            GaussianPSF.read(group["psf"]),
+            read_psf(group["psf"]),
             PolynomialDistortion.read(group["distortion"]),
             conserve_flux=bool(group.attrs["conserve_flux"]),
             tolerance=float(group.attrs["tolerance"]),

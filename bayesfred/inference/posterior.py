@@ -62,7 +62,7 @@ class Nuisances:
     offset : bool
         Whether the pointing is unknown: parameters `offset_x`, `offset_y`, pixel, added to every source's position.
     psf_sigma : bool
-        Whether the PSF's width is unknown: parameter `psf_sigma`, pixel.
+        Whether the PSF's width is unknown: parameter `psf_sigma`, pixel, the `sigma` that a PSF of any kind has.
     background_order : {0, 1, 2}
         Degree of the background polynomial in u and v, which run from -1 to 1 over the frame: parameters
         `background`, then `background_u`, `background_v`, then `background_u2`, `background_uv`, `background_v2`, counts per pixel.

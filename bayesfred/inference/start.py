@@ -363,7 +363,7 @@ def _part(posterior: Posterior, sources: Flags, pixels: Flags, width: float) -> 
     blur = np.sqrt(width**2 - model.psf.sigma**2) / model.detector.binning
     few = SourceCatalog(s.x[sources], s.y[sources], s.flux[sources])
     return Posterior(
-        replace(model, sources=few, psf=GaussianPSF(width)),
+        replace(model, sources=few, psf=GaussianPSF(width) if blur > 0 else model.psf),
         ndimage.gaussian_filter(posterior.counts, blur) if blur > 0 else posterior.counts,
         prior=posterior.prior,
         noise=posterior.noise,
