@@ -4,7 +4,8 @@ A model is scored by elpd, the sum over pixels of log p(n_i | the other pixels).
 posterior, p(n_i | the others) is the harmonic mean of p(n_i | theta_s): leaving a pixel out weights the draws by
 1 / p(n_i | theta_s). A frame has so many pixels that hardly any weights differ: where all of a pixel's lie within a factor
 e^`SPREAD` their plain mean is known to a hundredth, and elsewhere their largest are replaced by those of a fitted Pareto
-distribution, whose shape says whether the weights can be trusted. Differences of elpd are judged by the scatter of the pixels' differences.
+distribution, whose shape says whether the weights can be trusted. Differences of elpd are judged by the scatter of the pixels'
+differences.
 
 References
 ----------

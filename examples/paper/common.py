@@ -1,5 +1,6 @@
 """What the tables and figures share: the printed numbers, the paper's field, rows that compare, pictures."""
 
+import io
 import math
 import tempfile
 import tomllib
@@ -8,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import matplotlib.figure
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 from scipy import linalg, optimize
 
 import bayesfred as bf
@@ -23,9 +24,17 @@ PRINTED: dict[str, Any] = tomllib.loads((HERE / "printed.toml").read_text(encodi
 
 # Powers (i, j, m, n) of x, y, u, v.
 TERMS = {
-    "ux": (1, 0, 1, 0), "vx": (1, 0, 0, 1), "u2x": (1, 0, 2, 0), "v2x": (1, 0, 0, 2), "ux2": (2, 0, 1, 0), "vx2": (2, 0, 0, 1),
-    "uvx": (1, 0, 1, 1), "u2x2": (2, 0, 2, 0), "v2x2": (2, 0, 0, 2), "uvx2": (2, 0, 1, 1),
-}  # fmt: skip
+    "ux": (1, 0, 1, 0),
+    "vx": (1, 0, 0, 1),
+    "u2x": (1, 0, 2, 0),
+    "v2x": (1, 0, 0, 2),
+    "ux2": (2, 0, 1, 0),
+    "vx2": (2, 0, 0, 1),
+    "uvx": (1, 0, 1, 1),
+    "u2x2": (2, 0, 2, 0),
+    "v2x2": (2, 0, 0, 2),
+    "uvx2": (2, 0, 1, 1),
+}
 
 # How the six columns of f in Tables 2 and 3 can be read; those of g likewise, in x or in y.
 AS_PRINTED = ("ux", "vx", "u2x", "v2x", "ux2", "vx2")
@@ -69,8 +78,17 @@ def least_squares(model: bf.ForwardModel, frame: Floats, start: ArrayLike) -> tu
     def slopes(theta: Floats) -> Floats:
         return np.asarray((model.jacobian(theta) / flux).reshape(start.size, -1).T)
 
-    fit = optimize.least_squares(residual, start, slopes, method="lm", x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15)
-    return fit.x, -fit.fun.reshape(frame.shape) * flux, float(np.sum(fit.fun**2))
+    theta = optimize.least_squares(residual, start, slopes, method="lm", x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15).x
+    left = residual(theta)
+    for _ in range(5):  # Gauss-Newton steps, as far as rounding lets them gain
+        matrix = slopes(theta)
+        scale = np.sqrt(np.sum(matrix**2, axis=0))
+        step = theta - np.linalg.lstsq(matrix / scale, left)[0] / scale
+        after = residual(step)
+        if after @ after >= left @ left:
+            break
+        theta, left = step, after
+    return theta, -left.reshape(frame.shape) * flux, float(left @ left)
 
 
 def background_bound(model: bf.ForwardModel, theta: Floats, background: float) -> Floats:
@@ -140,6 +158,11 @@ def measured(value: float, sd: float) -> str:
     return f"{value:.{places}f} ± {sd:.{places}f}"
 
 
+def listed(values: ArrayLike, places: int) -> str:
+    """Several numbers in one cell; -0 is 0."""
+    return ", ".join(f"{value:.{places}f}" for value in np.round(values, places) + 0.0)
+
+
 def small(value: float) -> str:
     """A number whose size alone matters: rounding decides its digits."""
     return f"about {value:.0e}"
@@ -152,24 +175,39 @@ def same(paper: float, ours: float, sd: float, rounding: float = 0.0) -> bool:
 
 # ------------------------------------------------------------------------------------------------------------------ pictures
 
-STYLE = {"font.size": 8, "axes.titlesize": 8, "figure.dpi": 90, "savefig.dpi": 90, "image.interpolation": "nearest"}
+FONT = {"fontsize": 8}
 
 
 def panels(rows: int, columns: int, size: float = 2.5) -> tuple[Any, Any]:
     """A figure with a grid of axes for frames."""
-    with mpl.rc_context(STYLE):
-        figure = mpl.figure.Figure(figsize=(size * columns + 0.6, size * rows + 0.2), layout="constrained")
-        return figure, figure.subplots(rows, columns, squeeze=False)
+    figure = matplotlib.figure.Figure(figsize=(size * columns + 0.8, size * rows + 0.2), dpi=90, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def name_axes(axes: Any, title: str, across: str, down: str) -> None:
+    """Title and labels, small."""
+    axes.set_title(title, **FONT)
+    axes.set_xlabel(across, **FONT)
+    axes.set_ylabel(down, **FONT)
+    axes.tick_params(labelsize=7)
 
 
 def show(axes: Any, image: Floats, title: str, *, step: float = 1.0, colours: str = "viridis", **scale: Any) -> Any:
     """Draw a frame, v downwards as in the paper, coordinates from the middle in fine pixels."""
     ny, nx = image.shape
     extent = (-0.5 * nx * step, 0.5 * nx * step, 0.5 * ny * step, -0.5 * ny * step)
-    drawn = axes.imshow(image, extent=extent, cmap=colours, **scale)
-    axes.set(title=title, xlabel="u / pixel", ylabel="v / pixel", aspect="equal")
+    drawn = axes.imshow(image, extent=extent, cmap=colours, interpolation="nearest", aspect="equal", **scale)
+    name_axes(axes, title, "u / pixel", "v / pixel")
     axes.label_outer()
     return drawn
+
+
+def bar(drawn: Any, axes: Any, label: str, **options: Any) -> None:
+    """The colours' scale beside one or several axes."""
+    scale = drawn.figure.colorbar(drawn, ax=axes, pad=0.02, **options)
+    scale.set_label(label, **FONT)
+    scale.ax.tick_params(labelsize=7)
+    scale.ax.yaxis.get_offset_text().set_fontsize(7)
 
 
 def symmetric(*images: Floats) -> dict[str, float]:
@@ -179,7 +217,8 @@ def symmetric(*images: Floats) -> dict[str, float]:
 
 
 def save(figure: Any, name: str, folder: Path) -> str:
-    """Write a picture small: 256 colours at most, which these pictures do not exceed visibly."""
-    with mpl.rc_context(STYLE):
-        figure.savefig(folder / name)
+    """Write a picture with 256 colours, which makes it three times smaller."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn)
+    Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(folder / name, optimize=True)
     return name

@@ -1,8 +1,9 @@
 """Fig. 6: the polynomial and the logarithmic frame reconstructed, their residuals, V; and how many terms the logarithm needs.
 
-V is the sum over pixels of squared residuals in units of a source's flux, for frames without noise as in the paper. What is left of the
-logarithm with the paper's 12 terms has structure. More terms are tried on a frame of Poisson counts (background 5): f = x times, g = y times
-every u^2a v^2b up to a + b = K, which is the logarithm's own series with free coefficients. Leave-one-out says how many are worth having.
+V is the sum over pixels of squared residuals in units of a source's flux, for frames without noise as in the paper. What is left
+of the logarithm with the paper's 12 terms has structure. More terms are tried on a frame of Poisson counts (background 5): f = x
+times, g = y times every u^2a v^2b up to a + b = K, which is the logarithm's own series with free coefficients. Leave-one-out says
+how many are worth having.
 """
 
 from pathlib import Path
@@ -11,7 +12,22 @@ import numpy as np
 
 import bayesfred as bf
 
-from .common import DISTORTION, PRINTED, Floats, Row, Section, fit, least_squares, paper_model, panels, save, show, small, symmetric, truth
+from .common import (
+    PRINTED,
+    Floats,
+    Row,
+    Section,
+    bar,
+    fit,
+    least_squares,
+    panels,
+    paper_model,
+    save,
+    show,
+    small,
+    symmetric,
+    truth,
+)
 from .frames import figure2
 
 BACKGROUND = 5.0
@@ -44,9 +60,13 @@ def make(quick: bool, folder: Path) -> Section:
     theta, left, value = least_squares(model, polynomial, np.zeros(12))
     rows = [
         Row("polynomial: V", "no visible structure", small(value), value < 1e-20, "rounding"),
-        Row("polynomial: largest error of a coefficient, 1e-6", "0.00",
-            small(float(np.abs(theta - truth("table2")).max() / 1e-6)), bool(np.abs(theta - truth("table2")).max() < 5e-9)),
-    ]  # fmt: skip
+        Row(
+            "polynomial: largest error of a coefficient, 1e-6",
+            "0.00",
+            small(float(np.abs(theta - truth("table2")).max() / 1e-6)),
+            bool(np.abs(theta - truth("table2")).max() < 5e-9),
+        ),
+    ]
     if quick:
         return Section("Fig. 6: reconstructions", "", rows)
     logarithm = figure2("logarithm")
@@ -69,9 +89,14 @@ def make(quick: bool, folder: Path) -> Section:
         s = scores[name]
         behind = f"{s.difference:.0f} ± {s.difference_se:.0f}" if s.difference else "best"
         rows.append(
-            Row(f"logarithm, Poisson counts, {name}: elpd behind the best", "", behind, None,
-                f"largest mean residual of 10 x 10 pixels: {structure(*residuals[name]):.1f} standard errors")
-        )  # fmt: skip
+            Row(
+                f"logarithm, Poisson counts, {name}: elpd behind the best",
+                "",
+                behind,
+                None,
+                f"largest mean residual of 10 x 10 pixels: {structure(*residuals[name]):.1f} standard errors",
+            )
+        )
     chosen = compared.chosen
     d = paper_model(series(ORDERS[[names[k] for k in ORDERS].index(chosen)])) if chosen in names.values() else model
     _, left_chosen, value_chosen = least_squares(d, logarithm, fits[chosen].estimate.params[: d.distortion.n_terms])
@@ -81,8 +106,8 @@ def make(quick: bool, folder: Path) -> Section:
         _terms(residuals, folder),
     ]
     text = (
-        "Frames without noise for V, in units of the source flux squared. The last rows add Poisson counts and ask how many terms the "
-        "logarithm deserves: `bf.compare` of models with every x u^2a v^2b, y u^2a v^2b up to a + b = K. 10 x 10 pixels' mean "
+        "Frames without noise for V, in units of the source flux squared. The last rows add Poisson counts and ask how many terms "
+        "the logarithm deserves: `bf.compare` of models with every x u^2a v^2b, y u^2a v^2b up to a + b = K. 10 x 10 pixels' mean "
         "residuals of 2500 blocks reach 3.6 standard errors by chance."
     )
     return Section("Fig. 6: reconstructions", text, rows, pictures)
@@ -97,7 +122,7 @@ def _reconstructions(
         (axes[1, 0], logarithm - left_12, "Fig. 6c: logarithm, reconstructed"),
     ):
         drawn = show(axis, image, title, vmin=0.0, vmax=float(max(polynomial.max(), logarithm.max())))
-        figure.colorbar(drawn, ax=axis, label="counts per pixel", shrink=0.8)
+        bar(drawn, axis, "counts per pixel")
     for axis, image, title in (
         (axes[0, 1], left, "Fig. 6b: residual, polynomial"),
         (axes[1, 1], left_12, "Fig. 6d: residual, 12 terms"),
@@ -105,7 +130,7 @@ def _reconstructions(
     ):
         scale = symmetric(image) if axis is axes[0, 1] else symmetric(left_12, left_chosen)
         drawn = show(axis, image, title, colours="RdBu_r", **scale)
-        figure.colorbar(drawn, ax=axis, label="counts per pixel", shrink=0.8)
+        bar(drawn, axis, "counts per pixel")
     axes[0, 2].set_axis_off()
     return save(figure, "figure_6.png", folder)
 
@@ -115,5 +140,5 @@ def _terms(residuals: dict[str, tuple[Floats, Floats]], folder: Path) -> str:
     for axis, (name, (residual, sigma)) in zip(axes.flat, residuals.items(), strict=True):
         smooth = (residual / sigma)[:500, :500].reshape(100, 5, 100, 5).mean(axis=(1, 3)) * 5.0
         drawn = show(axis, smooth, name, step=5.0, colours="RdBu_r", vmin=-5.0, vmax=5.0)
-    figure.colorbar(drawn, ax=axes, label="mean residual of 5 x 5 pixels / its standard error", extend="both")
+    bar(drawn, axes, "mean residual of 5 x 5 pixels / its standard error", extend="both")
     return save(figure, "figure_6_terms.png", folder)

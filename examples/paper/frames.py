@@ -10,7 +10,7 @@ import numpy as np
 
 import bayesfred as bf
 
-from .common import PRINTED, TERMS, Floats, Row, Section, paper_model, panels, save, show, small, truth
+from .common import PRINTED, TERMS, Floats, Row, Section, bar, name_axes, panels, paper_model, save, show, small, truth
 
 LABEL = "expected counts per pixel"
 
@@ -43,13 +43,25 @@ def make(quick: bool, folder: Path) -> Section:
     kept = float(paper_model(bf.LogDistortion(1e-5)).expected_counts([]).sum()) / total
     table2 = float(np.abs(model.expected_counts(truth("table2")) - frames["polynomial"]).max() / frames["polynomial"].max())
     rows = [
-        Row("Table 2's true coefficients, read as below, against Fig. 2b: largest difference / peak", "0",
-            small(table2), table2 < 1e-12, "the same functions, so the columns are u x², v x², u x, v x, u² x, v² x and g is in y"),
-        Row("Fig. 2c: corner source moves, pixel", "", f"{float(np.hypot(corner - u, corner - v)):.1f}", None, "stars are 50 apart"),
-        Row("Fig. 2b: sources' flux in the frame / flux emitted", "1", f"{frames['polynomial'].sum() / total:.3f}", False,
-            "the paper asks the kernel to keep flux; the kernel it draws lacks the Jacobian determinant"),
+        Row(
+            "Table 2's true coefficients, read as below, against Fig. 2b: largest difference / peak",
+            "0",
+            small(table2),
+            table2 < 1e-12,
+            "the same functions, so the columns are u x², v x², u x, v x, u² x, v² x and g is in y",
+        ),
+        Row(
+            "Fig. 2c: corner source moves, pixel", "", f"{float(np.hypot(corner - u, corner - v)):.1f}", None, "stars are 50 apart"
+        ),
+        Row(
+            "Fig. 2b: sources' flux in the frame / flux emitted",
+            "1",
+            f"{frames['polynomial'].sum() / total:.3f}",
+            False,
+            "the paper asks the kernel to keep flux; the kernel it draws lacks the Jacobian determinant",
+        ),
         Row("Fig. 2c: sources' flux in the frame / flux emitted", "1", f"{kept:.3f}", False, "the same"),
-    ]  # fmt: skip
+    ]
     pictures = []
     if not quick:
         pictures = [_figures_1_and_2(frames, folder), _figure_3(folder)]
@@ -64,15 +76,13 @@ def _figures_1_and_2(frames: dict[str, Floats], folder: Path) -> str:
     figure, axes = panels(1, 4)
     s = paper_model().sources
     axes[0, 0].plot(s.x, s.y, ".", color="black", markersize=3)
-    axes[0, 0].set(
-        xlim=(-252.5, 252.5), ylim=(252.5, -252.5), aspect="equal", xlabel="x / pixel", ylabel="y / pixel",
-        title="Fig. 1: the object, 9 x 9 sources",
-    )  # fmt: skip
+    axes[0, 0].set(xlim=(-252.5, 252.5), ylim=(252.5, -252.5), aspect="equal")
+    name_axes(axes[0, 0], "Fig. 1: 9 x 9 sources", "x / pixel", "y / pixel")
     top = max(frame.max() for frame in frames.values())
     titles = ("Fig. 2a: shift-invariant", "Fig. 2b: polynomial", "Fig. 2c: logarithmic")
     for axis, frame, title in zip(axes[0, 1:], frames.values(), titles, strict=True):
         drawn = show(axis, frame, title, vmin=0.0, vmax=top)
-    figure.colorbar(drawn, ax=axes[0, 1:], label=LABEL, pad=0.01)
+    bar(drawn, axes[0, 1:], LABEL)
     return save(figure, "figures_1_and_2.png", folder)
 
 
@@ -85,5 +95,5 @@ def _figure_3(folder: Path) -> str:
     for axis, letter, ((name, coefficient), image) in zip(axes.flat, "abcdefgh", images.items(), strict=True):
         pretty = name.replace("2", "²")
         drawn = show(axis, image, f"Fig. 3{letter}: f = {coefficient:g} {pretty}", vmin=0.0, vmax=top)
-    figure.colorbar(drawn, ax=axes, label=LABEL, pad=0.01)
+    bar(drawn, axes, LABEL)
     return save(figure, "figure_3.png", folder)

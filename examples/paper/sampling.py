@@ -12,7 +12,7 @@ from scipy import linalg, stats
 
 import bayesfred as bf
 
-from .common import PRINTED, Floats, Row, Section, measured, panels, save, show, small, symmetric
+from .common import PRINTED, Floats, Row, Section, bar, measured, name_axes, panels, save, show, small, symmetric
 
 SIDE = 101
 SPOTS = (31, 6.0, 3000.0, 20.0)  # frame, source at +-x and +-y, photons, background: small, so that it can be fitted often
@@ -85,11 +85,22 @@ def coverage_rows(trials: int) -> list[Row]:
         error = float(inside.std(ddof=1) / np.sqrt(len(inside)))
         spread = float(np.sqrt(np.mean(z**2)))
         rows += [
-            Row(f"{way}: coverage of the 90 % intervals", "", measured(float(inside.mean()), error), None,
-                f"sigma {NARROW}, {trials} simulated frames, 4 coefficients; ± is the Monte Carlo error"),
+            Row(
+                f"{way}: coverage of the 90 % intervals",
+                "",
+                measured(float(inside.mean()), error),
+                None,
+                f"sigma {NARROW}, {trials} simulated frames, 4 coefficients; ± is the Monte Carlo error",
+            ),
             Row(f"{way}: true error / quoted error", "", measured(spread, spread / np.sqrt(2.0 * z.size)), None),
-            Row(f"{way}: Pearson's chi-square per pixel", "", f"{chi2.mean():.3f}", None, "1 where the noise is what the fit assumes"),
-        ]  # fmt: skip
+            Row(
+                f"{way}: Pearson's chi-square per pixel",
+                "",
+                f"{chi2.mean():.3f}",
+                None,
+                "1 where the noise is what the fit assumes",
+            ),
+        ]
     return rows
 
 
@@ -101,17 +112,35 @@ def make(quick: bool, folder: Path) -> Section:
     worst = float(np.abs(before).max())
     rows = [
         Row("largest error of a recorded pixel / peak", "about 1 %", f"{worst:.2%}", abs(worst / p["uncorrected"] - 1.0) < 0.5),
-        Row("largest error after correction / peak", f"{p['corrected']:g}", small(float(np.abs(after).max())),
-            bool(np.abs(after).max() <= p["corrected"]), "R from the sine integral, solved as Toeplitz matrix: rounding is left"),
-        Row("R's inverse: white noise of one pixel grows by", "", f"{noise_growth(SIDE):.3f}", None,
-            "in standard deviation, and neighbours become correlated"),
-        *(Row(f"frame corrected, sigma {s}: quoted error / true error", "", f"{quoted_over_true(s):.3f}", None,
-              "linear propagation; with the pixel in the model it is 1") for s in (p["psf_sigma"], NARROW)),
+        Row(
+            "largest error after correction / peak",
+            f"{p['corrected']:g}",
+            small(float(np.abs(after).max())),
+            bool(np.abs(after).max() <= p["corrected"]),
+            "R from the sine integral, solved as Toeplitz matrix: rounding is left",
+        ),
+        Row(
+            "R's inverse: white noise of one pixel grows by",
+            "",
+            f"{noise_growth(SIDE):.3f}",
+            None,
+            "in standard deviation, and neighbours become correlated",
+        ),
+        *(
+            Row(
+                f"frame corrected, sigma {s}: quoted error / true error",
+                "",
+                f"{quoted_over_true(s):.3f}",
+                None,
+                "linear propagation; with the pixel in the model it is 1",
+            )
+            for s in (p["psf_sigma"], NARROW)
+        ),
         *([] if quick else coverage_rows(TRIALS)),
-    ]  # fmt: skip
+    ]
     text = (
-        "The paper corrects the frame, which is exact without noise. With Poisson counts it makes the noise larger and correlated: a "
-        "fit that takes pixels for independent quotes errors that are too small, and its chi-square rejects the right model. "
+        "The paper corrects the frame, which is exact without noise. With Poisson counts it makes the noise larger and correlated: "
+        "a fit that takes pixels for independent quotes errors that are too small, and its chi-square rejects the right model. "
         '`Detector(pixel="box")` leaves the counts alone and puts R into the model.'
     )
     pictures = [] if quick else [_picture(ideal, recorded, corrected, before, after, folder)]
@@ -126,16 +155,18 @@ def noise_growth(n: int) -> float:
 
 def _picture(ideal: Floats, recorded: Floats, corrected: Floats, before: Floats, after: Floats, folder: Path) -> str:
     figure, axes = panels(2, 3)
-    for axis, letter, image, what in zip(axes[0], "abc", (ideal, recorded, corrected), ("ideal", "recorded", "corrected"), strict=True):
+    for axis, letter, image, what in zip(
+        axes[0], "abc", (ideal, recorded, corrected), ("ideal", "recorded", "corrected"), strict=True
+    ):
         middle = image[SIDE // 2 - 15 : SIDE // 2 + 16, SIDE // 2 - 15 : SIDE // 2 + 16]
         drawn = show(axis, middle, f"Fig. 4{letter}: {what}", vmin=0.0, vmax=1.0)
-    figure.colorbar(drawn, ax=axes[0], label="value / peak")
+    bar(drawn, axes[0], "value / peak")
     for axis, letter, image, what in zip(axes[1], "de", (before, after), ("recorded", "corrected"), strict=False):
         middle = image[SIDE // 2 - 15 : SIDE // 2 + 16, SIDE // 2 - 15 : SIDE // 2 + 16]
         drawn = show(axis, middle, f"Fig. 4{letter}: {what} - ideal", colours="RdBu_r", **symmetric(middle))
-        figure.colorbar(drawn, ax=axis, label="error / peak", shrink=0.8)
+        bar(drawn, axis, "error / peak")
     r = bf.sampling_matrix(21)
     drawn = axes[1, 2].imshow(r, cmap="viridis")
-    axes[1, 2].set(title="Fig. 4f: R, 21 of its rows and columns", xlabel="pixel m", ylabel="pixel i")
-    figure.colorbar(drawn, ax=axes[1, 2], label="R", shrink=0.8)
+    name_axes(axes[1, 2], "Fig. 4f: R, 21 of its rows", "pixel m", "pixel i")
+    bar(drawn, axes[1, 2], "R")
     return save(figure, "figure_4.png", folder)

@@ -1,9 +1,9 @@
 """Fig. 7 and Table 2: the polynomial frame with a background of 0, 5, 10 and 50 counts a pixel.
 
-Two kinds of noise: the paper's, where the sources' image is exact and the background alone is Poisson, and full Poisson counts. How the columns are
-to be read is judged by the chi-square of the printed errors against the Cramer-Rao covariance of the paper's noise (the background
-taken as known, as in the paper's V; each printed number rounded to 0.01, which adds a variance of 0.01^2 / 12): a fit at the bound has 12 on
-average.
+Two kinds of noise: the paper's, where the sources' image is exact and the background alone is Poisson, and full Poisson counts.
+How the columns are to be read is judged by the chi-square of the printed errors against the Cramer-Rao covariance of the paper's
+noise (the background taken as known, as in the paper's V; each printed number rounded to 0.01, which adds a variance of
+0.01^2 / 12): a fit at the bound has 12 on average.
 """
 
 from pathlib import Path
@@ -23,11 +23,13 @@ from .common import (
     Row,
     Section,
     background_bound,
+    bar,
     fit,
     least_squares,
+    listed,
     measured,
-    paper_model,
     panels,
+    paper_model,
     read_as,
     same,
     save,
@@ -93,20 +95,41 @@ def rows_of(row: dict[str, float], kind: str, quick: bool, scales: dict[str, Flo
     if kind == "paper's noise":
         z = (row["chi2"] - 1.0) / spread
         rows += [
-            Row(f"λ = {background}, {kind}: λ estimate", f"{row['background_estimate']:.4f}", measured(level, error),
-                same(row["background_estimate"], level, error)),
-            Row(f"λ = {background}, {kind}: χ²", f"{row['chi2']:.4f}", measured(chi2, spread), same(row["chi2"], chi2, spread),
-                f"printed - 1 is {z:+.1f} of its standard errors"),
-        ]  # fmt: skip
+            Row(
+                f"λ = {background}, {kind}: λ estimate",
+                f"{row['background_estimate']:.4f}",
+                measured(level, error),
+                same(row["background_estimate"], level, error),
+            ),
+            Row(
+                f"λ = {background}, {kind}: χ²",
+                f"{row['chi2']:.4f}",
+                measured(chi2, spread),
+                same(row["chi2"], chi2, spread),
+                f"printed - 1 is {z:+.1f} of its standard errors",
+            ),
+        ]
         ratio = found.sd[:12] / bound
-        rows.append(Row(f"λ = {background}, {kind}: posterior sd / Cramér-Rao bound", "", f"{ratio.min():.2f} to {ratio.max():.2f}", None,
-                        "12 coefficients; above 1 where the background, which is fitted too, costs; the paper gives no error bars"))  # fmt: skip
+        rows.append(
+            Row(
+                f"λ = {background}, {kind}: posterior sd / Cramér-Rao bound",
+                "",
+                f"{ratio.min():.2f} to {ratio.max():.2f}",
+                None,
+                "12 coefficients; above 1 where the background, which is fitted too, costs; the paper gives no error bars",
+            )
+        )
     else:
         expected = 1.0 + PRINTED["object"]["flux"] * 81 * kept() / (n * background)
         rows.append(
-            Row(f"λ = {background}, {kind}: χ² as the paper defines it", f"{row['chi2']:.4f}", f"{chi2:.2f}", False,
-                f"{expected:.2f} expected: it leaves the sources' own noise out; the paper's frames had none")
-        )  # fmt: skip
+            Row(
+                f"λ = {background}, {kind}: χ² as the paper defines it",
+                f"{row['chi2']:.4f}",
+                f"{chi2:.2f}",
+                False,
+                f"{expected:.2f} expected: it leaves the sources' own noise out; the paper's frames had none",
+            )
+        )
     scales[f"{background} {kind}"] = sd
     return rows
 
@@ -123,31 +146,39 @@ def make(quick: bool, folder: Path) -> Section:
     wide += [f"| {name} | " + " | ".join(f"{c:.1f}" for c in chi2) + " |" for name, chi2 in readings.items()]
     theta, _, value = least_squares(paper_model(), paper_model().expected_counts(truth("table2")), np.zeros(12))
     worst = float(np.abs(theta - truth("table2")).max() / T["unit"])
-    rows = [Row("λ = 0: largest error of a coefficient, 1e-6", "0.00", small(worst), worst < 0.005, f"V {small(value)}")]
+    exact = Row("λ = 0: the 12 coefficients, 1e-6", listed(T["row"][0]["theta"], 2), listed(theta / T["unit"], 2), worst < 0.005)
+    rows = [exact, Row("λ = 0: V", "", small(value), None, f"largest error of a coefficient {small(worst)}")]
     chosen = readings["ux², vx², ux, vx, u²x, v²x, g in y: taken here"]
-    rows.append(
-        Row("χ² of the printed errors, all three rows", "", f"{sum(chosen):.1f}", None,
-            f"36 expected at the bound, probability {stats.chi2.sf(sum(chosen), 36):.2f} of more; as printed {sum(readings[next(iter(readings))]):.0f}")
-    )  # fmt: skip
+    as_printed, more = sum(readings[next(iter(readings))]), stats.chi2.sf(sum(chosen), 36)
+    why = f"36 expected at the bound, probability {more:.2f} of more; as printed {as_printed:.0f}"
+    rows.append(Row("χ² of the printed errors, all three rows", "", f"{sum(chosen):.1f}", None, why))
     scales: dict[str, Floats] = {}
     for kind in ("paper's noise", "Poisson counts"):
         for row in NOISY:
             rows += rows_of(row, kind, quick, scales)
     for row in NOISY:
         ratio = scales[f"{row['background']} Poisson counts"][:12] / scales[f"{row['background']} paper's noise"][:12]
-        rows.append(Row(f"λ = {row['background']}: sd with Poisson counts / with the paper's noise", "",
-                        f"{ratio.min():.1f} to {ratio.max():.1f}", None, "what the sources' own photons add to the errors"))  # fmt: skip
+        rows.append(
+            Row(
+                f"λ = {row['background']}: sd with Poisson counts / with the paper's noise",
+                "",
+                f"{ratio.min():.1f} to {ratio.max():.1f}",
+                None,
+                "what the sources' own photons add to the errors",
+            )
+        )
     excess = [(row["chi2"] - 1.0) * np.sqrt(505**2 / 2.0) for row in NOISY]
     text = (
         "Chi-square, 12 degrees of freedom, of the printed errors for each reading of the columns is in the first table. The last "
         "reading is the only one in which the printed truth is the function of Fig. 2b, and Table 3 requires it (below). With it "
-        "the paper's point estimates are at the Cramér-Rao bound of its own noise: what it lacks is the error bar, and a likelihood "
-        "for sources that are Poisson too. The printed χ² exceed 1 by "
+        "the paper's point estimates are at the Cramér-Rao bound of its own noise: what it lacks is the error bar, and a "
+        "likelihood for sources that are Poisson too. The printed χ² exceed 1 by "
         + ", ".join(f"{z:.1f}" for z in excess)
         + " standard errors, which is more than chance: a misfit of "
         + ", ".join(f"{np.sqrt((row['chi2'] - 1.0) * row['background']):.1f}" for row in NOISY)
         + " counts a pixel (rms) would explain it."
-        " Errors are posterior standard deviations" + (" of the Laplace approximation." if quick else " of at least 1000 effective draws.")
+        " Errors are posterior standard deviations"
+        + (" of the Laplace approximation." if quick else " of at least 1000 effective draws.")
     )
     pictures = [] if quick else [_picture(folder)]
     return Section("Fig. 7, Table 2: noise", text, rows, pictures, "\n".join(wide))
@@ -163,8 +194,6 @@ def _picture(folder: Path) -> str:
         for axis, image, what in ((axes[0, column], counts, "frame"), (axes[1, column], mean, "fit")):
             drawn = show(axis, image, f"λ = {row['background']}: {what}", vmin=0.0, vmax=250.0)
         residual = show(axes[2, column], (counts - mean) / sigma, "residual", colours="RdBu_r", vmin=-4.0, vmax=4.0)
-    figure.colorbar(drawn, ax=axes[:2], label="counts per pixel", extend="max")
-    figure.colorbar(residual, ax=axes[2], label="residual / √λ", extend="both")
+    bar(drawn, axes[:2], "counts per pixel", extend="max")
+    bar(residual, axes[2], "residual / √λ", extend="both")
     return save(figure, "figure_7.png", folder)
-
-
