@@ -32,8 +32,8 @@ PathLike = str | os.PathLike[str]
 
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian PSF of 10 pixels. The "
-    "coefficients are those of its Table 2, read with g in y and the columns in the order u2x, v2x, ux, vx, ux2, vx2: the "
-    "reading in which the paper's results are possible."
+    "coefficients are those of its Table 2, read with g in y and the columns in the order u2x, v2x, ux, vx, ux2, vx2: one of the "
+    "readings in which the paper's results are possible."
 )
 
 

@@ -220,5 +220,7 @@ def save(figure: Any, name: str, folder: Path) -> str:
     """Write a picture with 256 colours, which makes it three times smaller."""
     drawn = io.BytesIO()
     figure.savefig(drawn)
-    Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(folder / name, optimize=True)
+    Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        folder / name, optimize=True
+    )
     return name

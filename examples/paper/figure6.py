@@ -31,7 +31,7 @@ from .common import (
 from .frames import figure2
 
 BACKGROUND = 5.0
-ORDERS = (2, 3, 4, 5, 6)
+ORDERS = (2, 3, 4, 5)
 
 
 def series(order: int) -> bf.PolynomialDistortion:
@@ -136,7 +136,7 @@ def _reconstructions(
 
 
 def _terms(residuals: dict[str, tuple[Floats, Floats]], folder: Path) -> str:
-    figure, axes = panels(2, 3)
+    figure, axes = panels(1, len(residuals), 2.2)
     for axis, (name, (residual, sigma)) in zip(axes.flat, residuals.items(), strict=True):
         smooth = (residual / sigma)[:500, :500].reshape(100, 5, 100, 5).mean(axis=(1, 3)) * 5.0
         drawn = show(axis, smooth, name, step=5.0, colours="RdBu_r", vmin=-5.0, vmax=5.0)
