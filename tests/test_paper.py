@@ -168,7 +168,9 @@ def test_reference_psf_of_a_lone_spot_is_exact() -> None:
 
 def test_reconstruction_without_noise_leaves_rounding() -> None:
     assert value(rows("figure6")["polynomial: V"]) < 1e-28
-    assert value(rows("table3")["polynomial: V, Fredholm"]) <= 1e-28
+    # coordinates u, x of 1500 pixels are rounded to 1e-13, a spot's values to 1e-14 and less: 324 pixels make some 1e-27
+    assert value(rows("table3")["polynomial: V, Fredholm"]) < 1e-25
+    assert value(rows("table3")["polynomial: V, Fredholm, as mean over the pixels"]) <= 1e-28
     assert value(rows("table3")["polynomial: V, pinhole"]) > 0.1
 
 

@@ -4,7 +4,7 @@
     python -m examples.paper table2 figure6    print these; pictures go to the current folder
     python -m examples.paper --quick           print what takes no sampling, in half a minute
 
-Everything takes about 10 minutes on two cores. Seeds are fixed, so that a run again gives the same numbers up to rounding.
+Everything takes five to ten minutes on two cores. Seeds are fixed, so that a run again gives the same numbers up to rounding.
 """
 
 import argparse

@@ -6,6 +6,7 @@ import tempfile
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,6 @@ class Fit:
     estimate: bf.MapEstimate
     sd: Floats
     chain: bf.Chain | None = None
-    ratio: float = math.nan  # largest of the draws' standard deviations over those of the Laplace approximation
 
 
 def fit(posterior: bf.Posterior, quick: bool, name: str = "", **options: Any) -> Fit:
@@ -115,12 +115,13 @@ def fit(posterior: bf.Posterior, quick: bool, name: str = "", **options: Any) ->
     laplace = np.sqrt(np.diag(estimate.covariance))
     if quick:
         return Fit(estimate, laplace)
-    chain = bf.sample(posterior, estimate, path=Path(_folder.name) / f"{name}.h5", seed=1, progress=False, **options)
-    sd = chain.draws().std(axis=0, ddof=1)
-    return Fit(estimate, sd, chain, float(np.max(np.abs(sd / laplace - 1.0))))
+    chain = bf.sample(posterior, estimate, path=Path(_chains().name) / f"{name}.h5", seed=1, progress=False, **options)
+    return Fit(estimate, chain.draws().std(axis=0, ddof=1), chain)
 
 
-_folder = tempfile.TemporaryDirectory(prefix="bayesfred-paper-")
+@cache
+def _chains() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="bayesfred-paper-")
 
 
 @dataclass
