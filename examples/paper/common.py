@@ -109,9 +109,16 @@ class Fit:
     chain: bf.Chain | None = None
 
 
-def fit(posterior: bf.Posterior, quick: bool, name: str = "", **options: Any) -> Fit:
-    """Maximise, and unless it must be quick, draw: the chain file is kept while the program runs."""
-    estimate = bf.find_map(posterior)
+def fit(posterior: bf.Posterior, quick: bool, name: str = "", near: Fit | None = None, **options: Any) -> Fit:
+    """Maximise, and unless it must be quick, draw: the chain file is kept while the program runs.
+
+    `near` is a fit of a model with fewer terms, to begin from.
+    """
+    start = None
+    if near and near.chain:
+        known = dict(zip(near.chain.parameter_names, near.estimate.params, strict=True))
+        start = [known.get(parameter, 0.0) for parameter in posterior.parameter_names]
+    estimate = bf.find_map(posterior, start)
     laplace = np.sqrt(np.diag(estimate.covariance))
     if quick:
         return Fit(estimate, laplace)

@@ -73,11 +73,13 @@ def make(quick: bool, folder: Path) -> Section:
     counts = logarithmic_counts()
     fits = {"12 terms": fit(bf.Posterior(model, counts), quick, "log12", target_ess=400)}
     _, left_12, value_12 = least_squares(model, logarithm, fits["12 terms"].estimate.params[:12])
-    names = {}
+    names: dict[int, str] = {}
     for order in ORDERS:
         distortion = series(order)
+        near = fits[names[order - 1]] if order > ORDERS[0] else None
         names[order] = f"{distortion.n_terms} terms (K = {order})"
-        fits[names[order]] = fit(bf.Posterior(paper_model(distortion), counts), quick, f"log{order}", target_ess=400)
+        posterior = bf.Posterior(paper_model(distortion), counts)
+        fits[names[order]] = fit(posterior, quick, f"log{order}", near, target_ess=400)
     compared = bf.compare({name: f.chain for name, f in fits.items() if f.chain}, draws=200)
     scores = {s.name: s for s in compared.scores}
     rows += [Row("logarithm, 12 terms: V", "structure", f"{value_12:.2e}", True, "the paper prints no V for this frame")]

@@ -175,10 +175,11 @@ def make(quick: bool, folder: Path) -> Section:
         ]
     text = (
         "Chosen where the paper is silent: 9 x 9 sources, 300 fine pixels apart; V is the sum over pixels in units of the flux "
-        "squared; the logarithm is f = x log(1 + 1e-8 (2u² + v²)), g = y log(1 + 1e-8 (3u² + 2v²)), because the printed coefficients are of that (x u² "
-        "and x v² differ by two; 1e-5 would mirror the corners); λ = 0.01 falls on fine pixels, 6.25 on a binned one, because "
-        "the pinhole's V then rises with the noise as printed. The first table is the evidence for the columns' order: what a "
-        "pinhole camera sees of the printed coefficients. It is also why the unit of k must be 1e-5 in binned pixels."
+        "squared; the logarithm is f = x log(1 + 1e-8 (2u² + v²)), g = y log(1 + 1e-8 (3u² + 2v²)), because the printed "
+        "coefficients are of that (x u² and x v² differ by two; 1e-5 would mirror the corners); λ = 0.01 falls on fine pixels, "
+        "6.25 on a binned one, because the pinhole's V then rises with the noise as printed. The first table is the evidence "
+        "for the columns' order: what a pinhole camera sees of the printed coefficients. It is also why the unit of k must be "
+        "1e-5 in binned pixels."
     )
     return Section("Fig. 8, 9, Table 3: small PSF, pinhole", text, rows, pictures, _evidence())
 
