@@ -142,5 +142,5 @@ def _terms(residuals: dict[str, tuple[Floats, Floats]], folder: Path) -> str:
     for axis, (name, (residual, sigma)) in zip(axes.flat, residuals.items(), strict=True):
         smooth = (residual / sigma)[:500, :500].reshape(100, 5, 100, 5).mean(axis=(1, 3)) * 5.0
         drawn = show(axis, smooth, name, step=5.0, colours="RdBu_r", vmin=-5.0, vmax=5.0)
-    bar(drawn, axes, "mean residual of 5 x 5 pixels / its standard error", extend="both")
+    bar(drawn, axes, "residual / its sd, 5 x 5 pixels", extend="both")
     return save(figure, "figure_6_terms.png", folder)
