@@ -188,7 +188,7 @@ FONT = {"fontsize": 8}
 
 def panels(rows: int, columns: int, size: float = 2.5) -> tuple[Any, Any]:
     """A figure with a grid of axes for frames."""
-    figure = matplotlib.figure.Figure(figsize=(size * columns + 0.8, size * rows + 0.2), dpi=90, layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(size * columns + 0.8, size * rows + 0.5), dpi=90, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
