@@ -331,6 +331,8 @@ def _report(
     Console(width=None if sys.stdout.isatty() else 120).print(_table(chain, diagnostics, truth))
     if chain.n_invalid:
         print(f"{chain.n_invalid} log-probabilities were NaN or infinite and taken as -inf: narrower priors avoid that")
+    if diagnostics.prior_dominated:
+        print(f"prior-dominated: {', '.join(diagnostics.prior_dominated)}: the frame does not decide alone, see the report")
     page, picture = _beside(chain.path)
     with _writing(page):
         html.write_report(
@@ -350,10 +352,10 @@ def _report(
 
 
 def _table(chain: Chain, diagnostics: Diagnostics, truth: Floats | None) -> Table:
-    """Coefficient, truth, MAP, posterior mean +- sd, z, and how well it is sampled."""
+    """Coefficient, truth, MAP, posterior mean +- sd, z, how well it is sampled, and how it responds to the prior."""
     table = Table()
     heads = ("MAP", "posterior mean +- sd") if truth is None else ("truth", "MAP", "posterior mean +- sd", "z")
-    for head in ("coefficient", *heads, "R-hat", "ESS"):
+    for head in ("coefficient", *heads, "R-hat", "ESS", "prior sens."):
         table.add_column(head, justify="left" if head == "coefficient" else "right", no_wrap=True)
     draws = chain.draws()
     for k, name in enumerate(chain.parameter_names):
@@ -370,5 +372,5 @@ def _table(chain: Chain, diagnostics: Diagnostics, truth: Floats | None) -> Tabl
         if truth is not None:
             cells = [number(truth[k]) + power, *cells, f"{(mean - truth[k]) / sd:+.2f}"]
         ess = min(diagnostics.ess_bulk[name], diagnostics.ess_tail[name])
-        table.add_row(name, *cells, f"{diagnostics.rhat[name]:.3f}", f"{ess:.0f}")
+        table.add_row(name, *cells, f"{diagnostics.rhat[name]:.3f}", f"{ess:.0f}", f"{diagnostics.prior_sensitivity[name]:.3f}")
     return table

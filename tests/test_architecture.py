@@ -523,7 +523,7 @@ def test_missing_heading_is_seen() -> None:
 
 # ---------------------------------------------------------------------------------------------------------------- weight, size
 
-HEAVY = ("arviz_base", "astropy", "emcee", "h5py", "matplotlib", "numba", "pydantic", "scipy")
+HEAVY = ("arviz_base", "arviz_stats", "astropy", "emcee", "h5py", "matplotlib", "numba", "pydantic", "scipy")
 
 
 def loaded(code: str) -> set[str]:

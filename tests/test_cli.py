@@ -294,6 +294,17 @@ def test_masked_pixels_are_counted(folder: Path) -> None:
     assert mask.sum() == mask.size - 1
 
 
+def test_what_the_prior_dominates_is_named(folder: Path) -> None:
+    # the frame alone knows the background, which is 3, to 0.026
+    prior = {"prior.background": 'distribution = "norm"\nloc = 3.05\nscale = 0.02'}
+    (folder / "run.toml").write_text(run_text(sampling=FEW_STEPS, **prior), encoding="utf-8")
+    output = invoke(folder, "fit", "run.toml")
+    assert "prior-dominated: background: " in output.stdout
+    assert "Prior-dominated: background." in (folder / "run.html").read_text(encoding="utf-8")
+    row = next(line for line in output.stdout.splitlines() if " background " in line)
+    assert float(row.split("│")[-2]) > 0.05
+
+
 def test_demo(tmp_path: Path) -> None:
     """4: of 13 scores, normal if the error bars hold, one in 1,200 demos has a larger one; the seed is fixed."""
     output = invoke(tmp_path, "demo", "--folder", "runs")
@@ -313,6 +324,8 @@ def test_demo(tmp_path: Path) -> None:
     for name, score in z.items():  # the table shows the same
         row = next(line for line in output.stdout.splitlines() if f" {name} " in line)
         assert any(abs(float(cell) - score) < 0.02 for cell in re.findall(r" ([+-]\d+\.\d\d) ", row))
+        assert float(row.split("│")[-2]) == pytest.approx(verdict.prior_sensitivity[name], abs=6e-4)
+    assert verdict.prior_dominated == () and "prior-dominated" not in output.stdout  # the default priors are weak
 
     before = snapshot(tmp_path)
     assert_refused(invoke(tmp_path, "demo", "--folder", "runs"), "demo.h5", "exists", "--overwrite")

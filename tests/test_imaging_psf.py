@@ -17,6 +17,7 @@ from test_inference_chain import reseal, run
 from test_inference_derivatives import STEP, errors, five_point
 from test_inference_map import excess
 
+from bayesfred import assembly, settings
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector, correct_sampling
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -323,6 +324,37 @@ def test_chain_files_hold_any_psf(psf: PSF, tmp_path: Path) -> None:
                 group.attrs["oversampling"] = before[0]
                 del group["values"]
                 group["values"] = before[1]
+
+
+def test_run_files_name_any_psf(tmp_path: Path) -> None:
+    example = (Path(settings.__file__).parent / "example.toml").read_text(encoding="utf-8")
+    assert example.count("sigma = 10.0") == 1
+    run_file = tmp_path / "run.toml"
+
+    def named(section: str) -> PSF:
+        run_file.write_text(example.replace('kind = "gaussian"', "").replace("sigma = 10.0", section), encoding="utf-8")
+        return assembly.reference_psf(settings.read_settings(run_file), run_file)
+
+    assert named("sigma = 2.5") == GaussianPSF(2.5)
+    assert named('kind = "moffat"\nfwhm = 4.0\nbeta = 3.0') == MoffatPSF(4.0, 3.0)
+    values = lopsided(2.0)
+    values[0, 0] = -1e-3
+    sampled = 'kind = "sampled"\npath = "psf.npy"\noversampling = 4'
+    with pytest.raises(InputError, match=r"run\.toml: got 'psf\.npy', expected a file"):
+        named(sampled)
+    for array, words in (
+        (values, None),
+        (values[1:], r"psf: values: got shape \(96, 97\)"),
+        (-values, "expected a positive one"),
+        (np.where(values > 0.5, np.nan, values), "pixels that are not finite"),
+    ):
+        np.save(tmp_path / "psf.npy", array)
+        if words is None:
+            psf = named(sampled)
+            assert isinstance(psf, SampledPSF) and np.array_equal(psf.values, values) and psf.oversampling == 4.0
+        else:
+            with pytest.raises(InputError, match=rf"psf\.npy: .*{words}"):
+                named(sampled)
 
 
 HOSTILE: list[tuple[str, Any, str]] = [

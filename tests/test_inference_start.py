@@ -259,6 +259,12 @@ def test_verdict() -> None:
     assert quiet.at_maximum and not quiet.converged and "check gain" in quiet.message
 
 
+def test_a_psf_wider_than_the_frame_leaves_no_peaks() -> None:
+    model = ForwardModel(Detector((24, 30)), SourceCatalog.grid(2, 10.0, 5e3), GaussianPSF(71.0), CUBIC)
+    posterior = Posterior(model, simulate(model, np.zeros(4), 0.1, seed=1))
+    assert find_peaks(posterior).shape == (0, 2)
+
+
 def test_consistent_frames_are_called_so() -> None:
     """The deviance of true models is within 5 standard deviations of its expectation, at 0.05 counts a pixel too."""
     model = grid(side=5)

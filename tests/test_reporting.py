@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.imaging.detector import Detector
@@ -50,6 +51,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         noise=SimpleNamespace(read_noise=0.0),
         nuisances=Nuisances(),
         model=model,
+        log_prior=lambda draws: np.zeros(len(draws)),
         expected_counts=lambda params: model.expected_counts(params[:4], params[4]),
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
     )
@@ -58,6 +60,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "path": Path("chains/a & b.h5"),
         "parameter_names": names,
         "chain": chain,
+        "log_prob": np.zeros(chain.shape[:3]),
         "accepted": np.full((4, 32), 10),
         "burn_in": 2,
         "seed": 7,
@@ -135,11 +138,23 @@ def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
 def test_page_says_what_it_must(tmp_path: Path) -> None:
     _, page = report(tmp_path, truth=np.append(TRUTH, BACKGROUND), notes=["Seen at dusk."], settings='{"seed": 7}')
     for words in ("converged: R-hat at most", "truth", "ESS bulk", "Pearson", "Deviance", "Seen at dusk.",
-                  '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5"):  # fmt: skip
+                  '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5",
+                  "Prior-dominated: none."):  # fmt: skip
         assert words in page.text
     # uncertainty to two digits, value to the same place, in one power of ten
     assert re.search(r"10−6 px−1\s+3\.00\s+3\.00\s+(3\.0\d|2\.9\d)\s+0\.12\s", page.text)
     assert re.search(r"background\s+counts\s+5\.000\s+5\.000\s+[45]\.\d{3}\s+0\.03\d\s", page.text)
+
+
+def test_page_names_what_the_prior_dominates(tmp_path: Path) -> None:
+    chain, posterior = run()
+    prior = norm(TRUTH[1] - 2e-7, 2e-7)
+    posterior.log_prior = lambda draws: prior.logpdf(draws[:, 1])
+    diagnostics = diagnose(chain)
+    _, page = report(tmp_path, diagnostics=diagnostics)
+    assert diagnostics.prior_dominated == (chain.parameter_names[1],)
+    assert "Prior-dominated: fux2." in page.text
+    assert f"{diagnostics.prior_sensitivity[chain.parameter_names[1]]:.3f}" in page.text
 
 
 def test_page_without_truth_or_notes(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_example_names_every_key(tmp_path: Path) -> None:
         assert name == "prior" or set(table[name]) == set(section.model_fields)
     # All of them at once, but for the keys that exclude others, are a run file.
     path = tmp_path / "run.toml"
-    path.write_text(re.sub(r"(?m)^(degree|[fg]_terms) = ", "# ", text))
+    path.write_text(re.sub(r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling) = |path = \"psf)", "# ", text))
     settings = read_settings(path)
     assert settings.prior["f_ux"].keywords == {"loc": 0.0, "scale": 1e-5}
     assert settings.catalogue.zero_point == 25.0
@@ -133,9 +133,20 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "psf",
             "sigma = 2\nqqq = 1",
-            "psf.qqq: unknown key, expected one of beta, fwhm, kind, oversampling, path, sigma",
+            "psf.qqq: unknown key, expected one of kind, sigma, fwhm, beta, path, oversampling",
         ),
         ("psf", "sigma = -1.5", "psf.sigma: got -1.5, expected a number greater than 0"),
+        ("psf", "", "psf: got no width, expected sigma with kind = 'gaussian'"),
+        ("psf", "fwhm = 2", "psf: got fwhm, expected sigma with kind = 'gaussian'"),
+        ("psf", 'kind = "moffat"\nfwhm = 2', "psf: got fwhm, expected fwhm and beta with kind = 'moffat'"),
+        ("psf", 'kind = "moffat"\nfwhm = 2\nbeta = 1', "psf.beta: got 1, expected a number greater than 1"),
+        ("psf", 'kind = "sampled"\nsigma = 2', "psf: got sigma, expected path and oversampling with kind = 'sampled'"),
+        (
+            "psf",
+            'kind = "sampled"\npath = "p.npy"\noversampling = 0.5',
+            "psf.oversampling: got 0.5, expected a number greater than or",
+        ),
+        ("psf", 'kind = "airy"', "psf.kind: got 'airy', expected "),
         (
             "catalogue",
             'path = "a"\nmagnitude = "m"',

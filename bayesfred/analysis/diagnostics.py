@@ -1,30 +1,39 @@
-"""What a finished run is worth: did the chain converge, and does the model fit the counts.
+"""What a finished run is worth: did the chain converge, does the model fit the counts, and how much of it is the prior's.
 
-`diagnose` puts both into one record. Convergence is judged on R-hat, effective sample sizes, acceptance and
+`diagnose` puts all into one record. Convergence is judged on R-hat, effective sample sizes, acceptance and
 the optimiser's own verdict (`bayesfred.inference.convergence` holds the estimators). The fit is judged at
 the MAP by three sums over the pixels that enter the likelihood: the paper's normalised chi-square,
 Pearson's statistic and the deviance. The last two come with the expectation and standard deviation they
-have when the model is true, see `bayesfred.inference.goodness`.
+have when the model is true, see `bayesfred.inference.goodness`. What the prior does to the posterior is
+read off the draws, weighted as if prior or likelihood were raised to a power near 1.
 
 References
 ----------
+N. Kallioinen, T. Paananen, P.-C. Buerkner, A. Vehtari (2024), Statistics and Computing 34, 57: power-scaling.
 R. Sun, S. Zhou, section on noise: the estimate of lambda and the normalised chi-square.
 A. Sokal (1996), Monte Carlo methods in statistical mechanics: the window of the autocorrelation time.
 """
 
+import warnings
 from dataclasses import dataclass
 
+import arviz_base
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from bayesfred.inference.chainfile import Chain
 from bayesfred.inference.convergence import autocorrelation, convergence
 from bayesfred.inference.goodness import goodness
+from bayesfred.inference.posterior import Posterior
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
 
 MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
+FEWEST = 100  # draws from which a sensitivity is read
+FLAT = 1e-6  # difference of log densities that moves no posterior
+INFORMATIVE = 0.05  # sensitivity; the threshold of Kallioinen et al., and of arviz
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,11 @@ class Diagnostics:
         Sum of (n - mu)^2 / variance, and what a true model, fitted, would give.
     deviance, deviance_expected, deviance_sd : float
         Sum of 2 (n log(n / mu) - n + mu), likewise.
+    prior_sensitivity, likelihood_sensitivity : dict of str to float
+        How far each parameter's posterior moves when the prior, or the likelihood, is raised to a power alpha: cumulative
+        Jensen-Shannon distance per unit of log2(alpha) at alpha = 1. nan where draws are too few or do not vary.
+    prior_dominated : tuple of str
+        Parameters whose prior sensitivity is at least 0.05: not the frame alone decides about them.
     """
 
     converged: bool
@@ -81,10 +95,13 @@ class Diagnostics:
     deviance: float
     deviance_expected: float
     deviance_sd: float
+    prior_sensitivity: dict[str, float]
+    likelihood_sensitivity: dict[str, float]
+    prior_dominated: tuple[str, ...]
 
 
 def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
-    """Judge whether a chain has converged and whether its model fits the counts.
+    """Judge whether a chain has converged, whether its model fits the counts, and what its prior does.
 
     Converged means: largest R-hat at most 1.01, every bulk and tail effective sample size at least
     `target_ess`, at least one move in ten accepted, and a MAP at which the gradient vanishes.
@@ -103,8 +120,9 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
     References
     ----------
     Sun and Zhou, the equations of lambda-hat and of the normalised chi-square, for `background_estimate` and
-    `chi2_paper`.
+    `chi2_paper`. Kallioinen et al. (2024) for the sensitivities.
     """
+    posterior = chain.posterior()
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape
@@ -114,6 +132,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
     total_steps = max(chain.chain.shape[1], 1)
     acceptance = float(np.mean(chain.accepted)) / total_steps
     converged, message = _verdict(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
+    prior, likelihood = _sensitivities(chain, posterior)
     return Diagnostics(
         converged=converged,
         message=message,
@@ -123,7 +142,10 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         tau=_by_name(names, tau),
         acceptance=acceptance,
         n_draws=n_ensembles * n_steps * n_walkers,
-        **goodness(chain.posterior(), chain.estimate.params),
+        prior_sensitivity=_by_name(names, prior),
+        likelihood_sensitivity=_by_name(names, likelihood),
+        prior_dominated=tuple(name for name, value in zip(names, prior, strict=True) if value >= INFORMATIVE),
+        **goodness(posterior, chain.estimate.params),
     )
 
 
@@ -151,6 +173,34 @@ def autocorrelation_time(series: NDArray[np.float64], window: float = 5.0) -> fl
     tau = 2.0 * np.cumsum(autocorrelation(series)) - 1.0
     closed = np.flatnonzero(np.arange(tau.size) >= window * tau)
     return float(tau[closed[0] if closed.size else -1])
+
+
+def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
+    names = chain.parameter_names
+    draws = chain.chain[:, chain.burn_in :].swapaxes(1, 2).reshape(-1, len(names))  # walker by walker
+    log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
+    log_prior = posterior.log_prior(draws)
+    return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
+
+
+def _sensitivity(names: tuple[str, ...], draws: NDArray[np.float64], log_part: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sensitivity of every parameter to that factor of the posterior whose logarithm at the draws is given, shape (d,)."""
+    from arviz_stats import psense  # takes long to load, and most of what imports this module judges no chain
+
+    if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
+        return np.full(len(names), np.nan)
+    if np.ptp(log_part) < FLAT:
+        return np.zeros(len(names))
+    posterior = {name: draws[None, :, k] for k, name in enumerate(names)}
+    data = arviz_base.from_dict({"posterior": posterior, "log_prior": {"part": log_part[None]}})
+    with warnings.catch_warnings(), np.errstate(invalid="ignore"), threadpool_limits(1, user_api="blas"):
+        warnings.filterwarnings("ignore", message="Number of tail draws")
+        try:
+            sensitivity = psense(data)
+        except ValueError:  # hardly a draw differs from another
+            return np.full(len(names), np.nan)
+    return np.array([float(sensitivity[name]) for name in names])
 
 
 def _by_name(names: tuple[str, ...], values: NDArray[np.float64]) -> dict[str, float]:

@@ -861,6 +861,7 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
     for k in range(out.shape[0]):
         out[k, :n] = 0.0
     order = 2.0 if template == 0 else 3.0
+    widens = basis.row.size > 0 and basis.row[-1] == n_f + n_g + 1  # the width is the last parameter, if it is one
     v_row = (j - 0.5 * (o.ny - 1)) * o.step
     u_row = (low - 0.5 * (o.nx - 1)) * o.step
     e, size, signed, along_a, along_b = samples[0, :n], samples[1, :n], samples[2, :n], samples[3, :n], samples[4, :n]
@@ -897,7 +898,8 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             else:
                 samples[5:] = 0.0
             _add_row_of(row_k, size)
-            _add_widening(row_s, size, order, along_a, along_b, sigma, ramp, t, ra, rb, o.degree)
+            if widens:
+                _add_widening(row_s, size, order, along_a, along_b, sigma, ramp, t, ra, rb, o.degree)
             _powers_row(powers, ramp, u, n)
             _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)

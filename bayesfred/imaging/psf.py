@@ -213,7 +213,7 @@ class SampledPSF:
 
     Examples
     --------
-    >>> x = np.arange(-32, 33) / 4
+    >>> x = np.arange(-48, 49) / 4
     >>> psf = SampledPSF(np.exp(-(x**2 + x[:, None] ** 2) / 8), oversampling=4)
     >>> round(psf.sigma, 2), round(float(psf.density(1.1, 0.3) / GaussianPSF(2.0).density(1.1, 0.3)), 5)
     (2.0, 1.0)

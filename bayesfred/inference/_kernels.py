@@ -102,24 +102,37 @@ class Workspace(NamedTuple):
     span: Ints  # (ny, 2) first and last marked segment of a row
     score: Floats  # (ny * stride,) scratch
     weight: Floats
+    heap: Floats  # what profiling fills anew on every call, kept because new memory costs more than its use
 
 
 class Clusters(NamedTuple):
-    """Groups of sources whose footprints share pixels: group c holds members[first[c]:first[c + 1]]."""
+    """Groups of sources whose footprints share pixels: group c holds members[first[c]:first[c + 1]], from top to bottom.
+
+    A group's symmetric matrices, a row for each template of each member, are stored row after row from the first member that
+    shares pixels with the row's own up to the diagonal. What is left out stays zero in Cholesky's factor.
+    """
 
     members: Ints
     first: Ints
-    start: Ints  # where the group's matrix begins in a flat array
+    lead: Ints  # column at which a row's storage begins, counted within the group
+    start: Ints  # where a row's column 0 would be in the group's storage
+    begin: Ints  # where the group's storage begins in a flat array
 
 
 @nb.njit(cache=True)
-def new_workspace(ny, pitch):
-    """Buffers for one thread."""
+def new_workspace(o, nuisances, free):
+    """Buffers for one thread; with free fluxes they hold the templates as they are without a distortion and a quarter more."""
+    ny, pitch = o.ny, o.ramp.size
     span = np.empty((ny, 2), np.int64)
     span[:, 0] = pitch
     span[:, 1] = -1
-    size = ny * pitch
-    return Workspace(np.zeros(size), np.zeros(size // SEGMENT, np.uint8), span, np.empty(size), np.empty(size))
+    size, room = ny * pitch, 0
+    if free:
+        maps = new_maps(o)
+        locate(o, np.zeros(o.f_powers.shape[0] + o.g_powers.shape[0]), 0.0, 0.0, nuisances[3], 6.0 * nuisances[4], maps)
+        fp = footprints(o, maps)
+        room = 3 * size + (5 if nuisances[4] == 0.0 else 15) * fp.start[fp.row.size] // 4
+    return Workspace(np.zeros(size), np.zeros(size // SEGMENT, np.uint8), span, np.empty(size), np.empty(size), np.empty(room))
 
 
 @inner(cache=True)
@@ -272,16 +285,6 @@ def _log_likelihood(counts, w, background):
     return total
 
 
-@inner(cache=True)
-def _stamps(o, maps, fp, sigma):
-    """Every source's image at unit flux, row after row; shape (1, samples)."""
-    out = np.zeros((1, fp.start[fp.row.size]))
-    work = new_work(o)
-    for s in range(o.x.size):
-        add_source(o, maps, fp, s, sigma, 1.0, fp.start, out[0], work)
-    return out
-
-
 class Rows(NamedTuple):
     """Buffers for a row of a basis."""
 
@@ -345,7 +348,7 @@ def _group(keys, size):
 def _clusters(boxes, ny, templates):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
-    parent = np.arange(size)
+    parent, reach = np.arange(size), np.arange(size)
     order = _group(boxes[:, 0], ny)[0]
     for i in range(size):
         s = order[i]
@@ -354,6 +357,7 @@ def _clusters(boxes, ny, templates):
             if boxes[t, 0] >= boxes[s, 1]:
                 break
             if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
+                reach[k] = min(reach[k], i)
                 p, q = s, t
                 while parent[p] != p:
                     parent[p] = parent[parent[p]]
@@ -373,11 +377,31 @@ def _clusters(boxes, ny, templates):
             groups += 1
         else:
             label[s] = label[p]
-    members, first = _group(label, groups)
-    start = np.zeros(groups + 1, np.int64)
+    place, first = _group(label[order], groups)
+    within = np.empty(size, np.int64)  # how many of a group come before each in the order
     for c in range(groups):
-        start[c + 1] = start[c] + (templates * (first[c + 1] - first[c])) ** 2
-    return Clusters(members, first, start)
+        for i in range(first[c], first[c + 1]):
+            within[place[i]] = i - first[c]
+    lead, start, begin = np.empty(size * templates, np.int64), np.empty(size * templates, np.int64), np.zeros(groups + 1, np.int64)
+    for c in range(groups):
+        total = 0
+        for i in range(first[c], first[c + 1]):
+            column = within[reach[place[i]]] * templates
+            for t in range(templates):
+                row = i * templates + t
+                lead[row] = column
+                start[row] = total - column
+                total += (i - first[c]) * templates + t + 1 - column
+        begin[c + 1] = begin[c] + total
+    return Clusters(order[place], first, lead, start, begin)
+
+
+@inner(cache=True)
+def _cluster(clusters, c, templates):
+    """A group's members, and lead and start of its rows."""
+    a, b = clusters.first[c], clusters.first[c + 1]
+    rows = slice(a * templates, b * templates)
+    return clusters.members[a:b], clusters.lead[rows], clusters.start[rows]
 
 
 @inner(cache=True, fastmath=REDUCE, error_model="numpy")
@@ -389,169 +413,244 @@ def _dot(a, b, weight):
 
 
 @inner(cache=True)
-def _gram(fp, boxes, members, stamps, weight, pitch, out):
-    """out[i, k] = sum over pixels of weight T_i T_k, both triangles; a source's templates follow each other."""
-    size = stamps.shape[0]
-    for i in range(members.size):
-        s = members[i]
-        for k in range(i + 1):
-            t = members[k]
-            block = out[i * size : (i + 1) * size, k * size : (k + 1) * size]
-            block[:] = 0.0
-            if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
-                for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-                    p = fp.first[s] + j - boxes[s, 0]
-                    q = fp.first[t] + j - boxes[t, 0]
-                    a = max(fp.low[p], fp.low[q])
-                    b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
-                    if a < b:
-                        ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
-                        for m in range(size):
-                            left = stamps[m, ps + a : ps + b]
-                            for n in range(size):
-                                block[m, n] += _dot(left, stamps[n, qs + a : qs + b], weight[j * pitch + a : j * pitch + b])
-            out[k * size : (k + 1) * size, i * size : (i + 1) * size] = block.T
+def _touch(boxes, s, t):
+    """Whether two footprints may share pixels."""
+    apart = boxes[t, 2] >= boxes[s, 3] or boxes[s, 2] >= boxes[t, 3] or boxes[t, 0] >= boxes[s, 1] or boxes[s, 0] >= boxes[t, 1]
+    return not apart
 
 
 @inner(cache=True)
-def _cholesky(h):
+def _gram(fp, boxes, members, lead, start, stamps, weight, at, out):
+    """out[i, k] = sum over pixels of weight T_i T_k, the lower triangle; a source's templates follow each other.
+
+    Row r of the footprints has its weights from weight[at[r]] on.
+    """
+    size = stamps.shape[0]
+    for i in range(members.size):
+        s = members[i]
+        for m in range(size):
+            row = i * size + m
+            out[start[row] + lead[row] : start[row] + row + 1] = 0.0
+        p = fp.first[s]
+        while p < fp.first[s + 1]:
+            end = _run(fp, s, p, at)
+            first, last = fp.start[p], fp.start[end]
+            for m in range(size):
+                for n in range(m + 1):
+                    part = weight[at[p] : at[p] + last - first]
+                    out[start[i * size + m] + i * size + n] += _dot(stamps[m, first:last], stamps[n, first:last], part)
+            p = end
+        for k in range(lead[i * size] // size, i):
+            t = members[k]
+            if not _touch(boxes, s, t):
+                continue
+            for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+                p = fp.first[s] + j - boxes[s, 0]
+                q = fp.first[t] + j - boxes[t, 0]
+                a = max(fp.low[p], fp.low[q])
+                b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+                if a < b:
+                    ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+                    part = weight[at[p] - fp.low[p] + a : at[p] - fp.low[p] + b]
+                    for m in range(size):
+                        left, row = stamps[m, ps + a : ps + b], start[i * size + m] + k * size
+                        for n in range(size):
+                            out[row + n] += _dot(left, stamps[n, qs + a : qs + b], part)
+
+
+@inner(cache=True)
+def _run(fp, s, i, at):
+    """The first of a source's rows after row i that does not follow the one before it both in its template and in an image."""
+    last = fp.first[s + 1]
+    i += 1
+    while i < last and at[i] == at[i - 1] + fp.size[i - 1]:
+        i += 1
+    return i
+
+
+@inner(cache=True, fastmath=REDUCE)
+def _inner(a, b):
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@inner(cache=True)
+def _cholesky(h, lead, start):
     """Lower triangle in place; False where the matrix is not positive definite."""
-    for i in range(h.shape[0]):
-        for k in range(i + 1):
-            total = h[i, k]
-            for m in range(k):
-                total -= h[i, m] * h[k, m]
+    for i in range(lead.size):
+        at = start[i]
+        for k in range(lead[i], i + 1):
+            first = max(lead[i], lead[k])
+            total = h[at + k] - _inner(h[at + first : at + k], h[start[k] + first : start[k] + k])
             if i > k:
-                h[i, k] = total / h[k, k]
+                h[at + k] = total / h[start[k] + k]
             elif total > 0.0:
-                h[i, i] = math.sqrt(total)
+                h[at + i] = math.sqrt(total)
             else:
                 return False
     return True
 
 
 @inner(cache=True)
-def _solve(lower, x):
+def _solve(lower, lead, start, x):
     """x <- (L L^T)^-1 x, in place."""
-    n = x.size
-    for i in range(n):
-        for m in range(i):
-            x[i] -= lower[i, m] * x[m]
-        x[i] /= lower[i, i]
-    for i in range(n - 1, -1, -1):
-        for m in range(i + 1, n):
-            x[i] -= lower[m, i] * x[m]
-        x[i] /= lower[i, i]
+    for i in range(x.size):
+        at = start[i]
+        x[i] = (x[i] - _inner(lower[at + lead[i] : at + i], x[lead[i] : i])) / lower[at + i]
+    for i in range(x.size - 1, -1, -1):
+        at = start[i]
+        x[i] /= lower[at + i]
+        for m in range(lead[i], i):
+            x[m] -= lower[at + m] * x[i]
 
 
 @inner(cache=True)
-def _draw(fp, s, template, amplitude, pitch, out):
+def _draw(fp, s, template, amplitude, at, out):
     """Add amplitude times one of a source's templates, shape (samples,), to an image."""
-    for i in range(fp.first[s], fp.first[s + 1]):
-        at = fp.row[i] * pitch + fp.low[i]
-        target = out[at : at + fp.size[i]]
-        stamp = template[fp.start[i] : fp.start[i + 1]]
+    i = fp.first[s]
+    while i < fp.first[s + 1]:
+        end = _run(fp, s, i, at)
+        stamp = template[fp.start[i] : fp.start[end]]
+        target = out[at[i] : at[i] + stamp.size]
         for k in range(stamp.size):
             target[k] += amplitude * stamp[k]
+        i = end
+
+
+@inner(cache=True)
+def _project(fp, s, template, image, at):
+    """Sum over a source's pixels of one of its templates times an image."""
+    total = 0.0
+    i = fp.first[s]
+    while i < fp.first[s + 1]:
+        end = _run(fp, s, i, at)
+        stamp = template[fp.start[i] : fp.start[end]]
+        total += _inner(stamp, image[at[i] : at[i] + stamp.size])
+        i = end
+    return total
+
+
+@inner(cache=True)
+def _room(w, first, size):
+    """A part of the workspace's heap, or new memory where it is too small."""
+    return w.heap[first : first + size] if first + size <= w.heap.size else np.empty(size)
+
+
+class Patch(NamedTuple):
+    """The pixels of a cluster, one after another: on every row the stretch that holds all its footprints."""
+
+    values: Floats
+    background: Floats
+    image: Floats
+    score: Floats
+    weight: Floats
+
+
+@inner(cache=True)
+def _patch(counts, w, fp, boxes, members, background, at):
+    """A cluster's pixels, without sources; where its footprints' rows begin among them goes into `at`."""
+    ny = w.span.shape[0]
+    pitch = w.image.size // ny
+    top, bottom = boxes[members[0], 0], 0
+    for s in members:
+        bottom = max(bottom, boxes[s, 1])
+    low, high = np.full(max(bottom - top, 0), pitch), np.zeros(max(bottom - top, 0), np.int64)
+    for s in members:
+        for i in range(fp.first[s], fp.first[s + 1]):
+            j = fp.row[i] - top
+            low[j] = min(low[j], fp.low[i])
+            high[j] = max(high[j], fp.low[i] + fp.size[i])
+    start = np.zeros(low.size + 1, np.int64)
+    for j in range(low.size):
+        start[j + 1] = start[j] + max(high[j] - low[j], 0)
+    size = start[low.size]
+    values, level, image = (_room(w, 0, size), _room(w, w.image.size, size), _room(w, 2 * w.image.size, size))
+    patch = Patch(values, level, image, w.score[:size], w.weight[:size])
+    patch.image[:] = 0.0
+    for j in range(low.size):
+        c0, c1, c2 = _background_row(background, top + j, ny)
+        for k in range(low[j], high[j]):
+            u = (2 * k - counts.nx + 1) / counts.nx
+            i = start[j] + k - low[j]
+            patch.values[i] = counts.values[(top + j) * pitch + k]
+            patch.background[i] = c0 + u * (c1 + u * c2)
+    for s in members:
+        for i in range(fp.first[s], fp.first[s + 1]):
+            j = fp.row[i] - top
+            at[i] = start[j] + fp.low[i] - low[j]
+    return patch
 
 
 @inner(cache=True, fastmath=FAST, error_model="numpy")
-def _weigh_run(image, values, u, step, c0, c1, c2, score, weight):
-    """score = n/mu - 1 and weight = n/mu^2, zero where masked."""
-    for i in range(image.size):
-        x = u + step * i
-        inverse = 1.0 / (image[i] + (c0 + x * (c1 + x * c2)))
+def _weigh_patch(patch):
+    """Score n/mu - 1 and weight n/mu^2 of Poisson counts, zero where masked."""
+    values, background, image, score, weight = patch
+    for i in range(values.size):
+        inverse = 1.0 / (image[i] + background[i])
         n = values[i] if values[i] > LIMIT else 0.0
         score[i] = n * inverse - (1.0 if values[i] > LIMIT else 0.0)
         weight[i] = n * inverse * inverse
 
 
-@inner(cache=True)
-def _weigh_footprint(counts, w, fp, s, background, score, weight):
-    """Score and weight of Poisson counts on one source's footprint."""
-    ny = w.span.shape[0]
-    pitch = w.image.size // ny
-    for i in range(fp.first[s], fp.first[s + 1]):
-        c0, c1, c2 = _background_row(background, fp.row[i], ny)
-        u = (2 * fp.low[i] - counts.nx + 1) / counts.nx
-        a = fp.row[i] * pitch + fp.low[i]
-        b = a + fp.size[i]
-        _weigh_run(w.image[a:b], counts.values[a:b], u, 2.0 / counts.nx, c0, c1, c2, score[a:b], weight[a:b])
-
-
-@inner(cache=True)
-def _blank(fp, s, pitch, out):
-    """Zero an image on one source's footprint."""
-    for i in range(fp.first[s], fp.first[s + 1]):
-        at = fp.row[i] * pitch + fp.low[i]
-        out[at : at + fp.size[i]] = 0.0
-
-
-@inner(cache=True, error_model="numpy")
-def _largest_change(counts, w, fp, s, background, change):
-    """Largest |change| / mu among one source's pixels that hold counts."""
-    ny = w.span.shape[0]
-    pitch = w.image.size // ny
-    largest = 0.0
-    for i in range(fp.first[s], fp.first[s + 1]):
-        c0, c1, c2 = _background_row(background, fp.row[i], ny)
-        for k in range(fp.size[i]):
-            at = fp.row[i] * pitch + fp.low[i] + k
-            if counts.values[at] > 0.0:
-                u = (2 * (fp.low[i] + k) - counts.nx + 1) / counts.nx
-                largest = max(largest, abs(change[at]) / (w.image[at] + c0 + u * (c1 + u * c2)))
-    return largest
-
-
-@inner(cache=True)
-def _first_flux(counts, w, fp, s, stamps, background):
-    """Least-squares flux of one source, its neighbours ignored."""
-    ny = w.span.shape[0]
-    pitch = w.image.size // ny
+@inner(cache=True, fastmath=REDUCE)
+def _flux_run(stamp, values, background):
+    """Sums of template times counts less background, and of template squared."""
     above, below = 0.0, 0.0
-    for i in range(fp.first[s], fp.first[s + 1]):
-        c0, c1, c2 = _background_row(background, fp.row[i], ny)
-        for k in range(fp.size[i]):
-            n = counts.values[fp.row[i] * pitch + fp.low[i] + k]
-            if n > LIMIT:
-                u = (2 * (fp.low[i] + k) - counts.nx + 1) / counts.nx
-                stamp = stamps[0, fp.start[i] + k]
-                above += stamp * (n - (c0 + u * (c1 + u * c2)))
-                below += stamp * stamp
+    for i in range(stamp.size):
+        k = stamp[i] if values[i] > LIMIT else 0.0
+        above += k * (values[i] - background[i])
+        below += k * k
+    return above, below
+
+
+@inner(cache=True)
+def _first_flux(fp, s, template, patch, at):
+    """Least-squares flux of one source, its neighbours ignored."""
+    above, below = 0.0, 0.0
+    i = fp.first[s]
+    while i < fp.first[s + 1]:
+        end = _run(fp, s, i, at)
+        stamp, pixels = template[fp.start[i] : fp.start[end]], slice(at[i], at[i] + fp.start[end] - fp.start[i])
+        more, norm = _flux_run(stamp, patch.values[pixels], patch.background[pixels])
+        above += more
+        below += norm
+        i = end
     return above / below if below > 0.0 else 0.0
 
 
 @inner(cache=True)
-def _project(fp, s, template, image, pitch):
-    """Sum over a source's pixels of one of its templates times an image."""
-    total = 0.0
-    for p in range(fp.first[s], fp.first[s + 1]):
-        at = fp.row[p] * pitch + fp.low[p]
-        for k in range(fp.size[p]):
-            total += template[fp.start[p] + k] * image[at + k]
-    return total
+def _add_block(i, start, out, first_second, first_third, second, second_third, third):
+    """Add to a source's own block of a matrix what its shifts are concerned with."""
+    row, column = start[3 * i + 1 : 3 * i + 3], 3 * i
+    out[row[0] + column] += first_second
+    out[row[1] + column] += first_third
+    out[row[0] + column + 1] += second
+    out[row[1] + column + 1] += second_third
+    out[row[1] + column + 2] += third
 
 
-@inner(cache=True)
-def _bend(fp, s, stamps, flux, score, pitch, sigma, g):
+@inner(cache=True, fastmath=REDUCE, error_model="numpy")
+def _bend(fp, s, stamps, flux, score, at, sigma, i, start, out):
     """Subtract from a source's block of H the second derivatives times the score, as they are for a PSF that no pixel blurs.
 
     K_xx = X^2/K - K/sigma^2, K_xy = X Y/K are a Gaussian's: near enough to make the steps that H gives converge several times
     faster, for any PSF where it falls no faster than a Gaussian does within eight widths.
     """
+    fx, fy, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0
     for p in range(fp.first[s], fp.first[s + 1]):
+        first = fp.start[p]
         for k in range(fp.size[p]):
-            at = fp.start[p] + k
-            r = score[fp.row[p] * pitch + fp.low[p] + k]
-            own = stamps[0, at] * flux
-            x, y = stamps[1, at], stamps[2, at]
-            if own > 1e-200 and x * x + y * y < (8.0 * own / sigma) ** 2:
-                g[0, 1] -= r * x / flux
-                g[0, 2] -= r * y / flux
-                g[1, 1] -= r * (x * x / own - own / (sigma * sigma))
-                g[1, 2] -= r * x * y / own
-                g[2, 2] -= r * (y * y / own - own / (sigma * sigma))
-    g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
+            own, x, y = stamps[0, first + k] * flux, stamps[1, first + k], stamps[2, first + k]
+            r = -score[at[p] + k] if own > 1e-200 and x * x + y * y < (8.0 * own / sigma) ** 2 else 0.0
+            inverse = 1.0 / max(own, 1e-200)
+            fx += r * x
+            fy += r * y
+            xx += r * (x * x * inverse - own / (sigma * sigma))
+            xy += r * x * y * inverse
+            yy += r * (y * y * inverse - own / (sigma * sigma))
+    _add_block(i, start, out, fx / flux, fy / flux, xx, xy, yy)
 
 
 @inner(cache=True, error_model="numpy")
@@ -562,82 +661,86 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
     Gamma(2, scale[s]), with density F exp(-F / scale) / scale^2. With three templates the shifts are free, and `maps` is left
     with the shifted sources.
     """
-    pitch = w.image.size // w.span.shape[0]
-    score, weight = w.score, w.weight
     size = stamps.shape[0]
     work = new_work(o)
+    at, frame = np.empty(fp.row.size, np.int64), row_starts(fp, w.image.size // w.span.shape[0])
     value = 0.0
     shift[:] = 0.0
     for c in range(clusters.first.size - 1):
-        members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
+        members, lead, start = _cluster(clusters, c, size)
+        h = factors[clusters.begin[c] : clusters.begin[c + 1]]
         n = members.size * size
-        h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
         step = np.empty(n)
+        patch = _patch(counts, w, fp, boxes, members, background, at)
         for s in members:
             if size > 1:
                 _make_templates(o, maps, fp, s, sigma, 1.0, stamps, work)
-            flux[s] = max(_first_flux(counts, w, fp, s, stamps, background), 0.01 * scale[s])
+            else:
+                stamps[0, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] = 0.0
+                add_source(o, maps, fp, s, sigma, 1.0, fp.start, stamps[0], work)
+            flux[s] = max(_first_flux(fp, s, stamps[0], patch, at), 0.01 * scale[s])
             stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= flux[s]
-            _draw(fp, s, stamps[0], flux[s], pitch, w.image)
-        converged = False
+            _draw(fp, s, stamps[0], flux[s], at, patch.image)
+        lower = h.copy() if size > 1 else h
+        distance, rate, converged, factored = 0.0, 1.0, False, False
         for _ in range(100):
-            for s in members:
-                _weigh_footprint(counts, w, fp, s, background, score, weight)
-            _gram(fp, boxes, members, stamps, weight, pitch, h)
+            _weigh_patch(patch)
+            fresh = converged or rate > 0.01  # otherwise the last matrix serves
+            if fresh:
+                _gram(fp, boxes, members, lead, start, stamps, patch.weight, at, h)
+                for i in range(n):
+                    h[start[i] + i] += 1.0 / flux[members[i // size]] ** 2 if i % size == 0 else 1.0 / scatter**2
+            if converged:
+                factored = _cholesky(h, lead, start)
+                break
             for i in range(n):
                 s, t = members[i // size], i % size
-                step[i] = _project(fp, s, stamps[t], score, pitch)
-                if t == 0:
-                    step[i] += 1.0 / flux[s] - 1.0 / scale[s]
-                    h[i, i] += 1.0 / flux[s] ** 2
-                else:
-                    step[i] -= shift[s, t - 1] / scatter**2
-                    h[i, i] += 1.0 / scatter**2
+                step[i] = _project(fp, s, stamps[t], patch.score, at)
+                step[i] += 1.0 / flux[s] - 1.0 / scale[s] if t == 0 else -shift[s, t - 1] / scatter**2
             gradient = step.copy()
-            lower = h.copy()
-            if size > 1:
-                for i in range(members.size):
-                    own = slice(i * size, (i + 1) * size)
-                    _bend(fp, members[i], stamps, flux[members[i]], score, pitch, sigma, lower[own, own])
-            if not _cholesky(lower):  # far from the maximum
+            if fresh and size > 1:
                 lower[:] = h
-                if not _cholesky(lower):
-                    break
-            _solve(lower, step)
-            if np.dot(gradient, step) <= 1e-18:  # the square of the distance in standard deviations
-                converged = True
+                for i in range(members.size):
+                    _bend(fp, members[i], stamps, flux[members[i]], patch.score, at, sigma, i, start, lower)
+            factored = not fresh or _cholesky(lower, lead, start)
+            if size > 1 and not factored:  # far from the maximum
+                lower[:] = h
+                factored = _cholesky(lower, lead, start)
+            if not factored:
                 break
+            _solve(lower, lead, start, step)
             largest = 0.0
             for i in range(n):
-                s, t = members[i // size], i % size
-                largest = max(largest, abs(step[i]) / (flux[s] if t == 0 else sigma))
-                if t == 0:
-                    _blank(fp, s, pitch, score)
-            for i in range(n):
-                _draw(fp, members[i // size], stamps[i % size], step[i], pitch, score)
-            for s in members:
-                largest = max(largest, _largest_change(counts, w, fp, s, background, score))
-            length = 1.0 / (1.0 + largest)
+                largest = max(largest, abs(step[i]) / (flux[members[i // size]] if i % size == 0 else sigma))
+            step *= 1.0 if largest < 0.5 else 1.0 / (1.0 + largest)
             for i in range(members.size):
-                s, by = members[i], length * step[i * size : (i + 1) * size]
+                s = members[i]
                 if size > 1:
-                    _draw(fp, s, stamps[0], -flux[s], pitch, w.image)
-                    flux[s] += by[0]
-                    shift[s] += by[1:]
-                    move(o, maps, s, by[1], by[2])
+                    _draw(fp, s, stamps[0], -flux[s], at, patch.image)
+                    flux[s] += step[i * size]
+                    shift[s] += step[i * size + 1 : i * size + 3]
+                    move(o, maps, s, step[i * size + 1], step[i * size + 2])
                     _make_templates(o, maps, fp, s, sigma, flux[s], stamps, work)
-                    _draw(fp, s, stamps[0], flux[s], pitch, w.image)
+                    _draw(fp, s, stamps[0], flux[s], at, patch.image)
                 else:
-                    flux[s] += by[0]
-                    _draw(fp, s, stamps[0], by[0], pitch, w.image)
-        if not (converged and _cholesky(h)):
+                    flux[s] += step[i]
+                    _draw(fp, s, stamps[0], step[i], at, patch.image)
+            # The square of the distance in standard deviations, and what a step leaves of it: in a Newton step of fluxes alone the
+            # square of the largest relative change.
+            before, distance = distance, np.dot(gradient, step)
+            rate = distance / before if before > 0.0 else 1.0
+            if fresh and size == 1:
+                rate = largest * largest
+            converged = distance * min(rate, 1.0) <= 1e-16
+        if not (converged and factored):
             return -math.inf
         for i in range(n):
-            value -= math.log(h[i, i])
+            value -= math.log(h[start[i] + i])
         for s in members:
             value += math.log(flux[s] / scale[s] ** 2) - flux[s] / scale[s] + 0.5 * math.log(2.0 * math.pi)
             if size > 1:
                 value -= 0.5 * (shift[s, 0] ** 2 + shift[s, 1] ** 2) / scatter**2 + 2.0 * math.log(scatter)
+            _draw(fp, s, stamps[0], flux[s], frame, w.image)
     return value
 
 
@@ -648,7 +751,7 @@ class Fitted(NamedTuple):
     boxes: Ints
     clusters: Clusters
     stamps: Floats  # (templates, samples)
-    factors: Floats  # Cholesky factors of H, cluster after cluster
+    factors: Floats  # Cholesky factors of H
     fluxes: Floats
     shifts: Floats  # (s, 2) pixel
 
@@ -680,10 +783,10 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
     templates = 3 if scatter > 0.0 else 1
     boxes = _boxes(fp) if free else np.empty((0, 4), np.int64)
     clusters = _clusters(boxes, o.ny, templates)
-    factors = np.empty(clusters.start[-1])
+    factors = np.empty(clusters.begin[-1])
     fluxes, shifts = np.empty(flux.size), np.zeros((flux.size, 2))
     if free:
-        stamps = np.empty((3, fp.start[fp.row.size])) if templates == 3 else _stamps(o, maps, fp, sigma)
+        stamps = _room(w, 3 * w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
         extra += _profile(
             o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, 0.5 * flux, fluxes, shifts, factors
         )
@@ -731,27 +834,35 @@ def _weigh(counts, w, background, curve):
 
 
 @inner(cache=True)
-def _mix(fp, boxes, members, stamps, inverse, out):
-    """The templates q = Q T of a cluster's sources, added to `out`."""
+def _mix(fp, boxes, members, lead, start, lower, stamps, out):
+    """The templates q = Q T of a cluster's sources, added to `out`; returns the diagonal of Q."""
     size = stamps.shape[0]
-    for i in range(members.size):
-        s = members[i]
-        for m in range(members.size):
+    diagonal, column = np.empty(lead.size), np.empty(lead.size)
+    for i in range(lead.size):
+        s, a = members[i // size], i % size
+        column[:] = 0.0
+        column[i] = 1.0
+        _solve(lower, lead, start, column)
+        diagonal[i] = column[i]
+        for m in range(lead[i] // size, members.size):
             t = members[m]
-            if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
-                for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-                    p = fp.first[s] + j - boxes[s, 0]
-                    q = fp.first[t] + j - boxes[t, 0]
-                    first, last = max(fp.low[p], fp.low[q]), min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
-                    for a in range(size):
-                        for b in range(size):
-                            factor = inverse[i * size + a, m * size + b]
-                            for k in range(first, last):
-                                out[a, fp.start[p] + k - fp.low[p]] += factor * stamps[b, fp.start[q] + k - fp.low[q]]
+            if boxes[t, 0] >= boxes[s, 1]:
+                break
+            if not _touch(boxes, s, t):
+                continue
+            for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+                p = fp.first[s] + j - boxes[s, 0]
+                q = fp.first[t] + j - boxes[t, 0]
+                first, last = max(fp.low[p], fp.low[q]), min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+                ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+                for b in range(size):
+                    for k in range(first, last):
+                        out[a, ps + k] += column[m * size + b] * stamps[b, qs + k]
+    return diagonal
 
 
 @inner(cache=True)
-def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, g):
+def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, i, start, g):
     """What a source's second derivatives K_xx, K_xy, K_yy and X, Y as dK add to its rows of e and G."""
     fp, stamps, flux = drawn.fitted.footprints, drawn.fitted.stamps, drawn.fitted.fluxes[s]
     pitch = w.image.size // w.span.shape[0]
@@ -770,12 +881,7 @@ def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, g):
             part[0] -= weight * (q1 * x + q2 * y)
             part[1] -= weight * (q0 * x + q1 * xx[k] + q2 * xy[k])
             part[2] -= weight * (q0 * y + q1 * xy[k] + q2 * yy[k])
-            g[0, 1] -= r * x
-            g[0, 2] -= r * y
-            g[1, 1] -= r * xx[k]
-            g[1, 2] -= r * xy[k]
-            g[2, 2] -= r * yy[k]
-    g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
+            _add_block(i, start, g, -r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy[k])
 
 
 @inner(cache=True)
@@ -783,7 +889,7 @@ def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
     """z, the templates q, the image A and the derivative by tau of the module's derivation."""
     fp, boxes, clusters, stamps, factors, flux, shift = drawn.fitted
     pitch = w.image.size // w.span.shape[0]
-    size = stamps.shape[0]
+    size, at = stamps.shape[0], row_starts(fp, w.image.size // w.span.shape[0])
     h, y = np.zeros(w.image.size), np.zeros(w.image.size)
     z = np.empty((flux.size, size))
     mixed = np.zeros(stamps.shape)
@@ -791,46 +897,41 @@ def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
     rows = _new_rows(o, constants, pitch)
     slope = 0.0
     for c in range(clusters.first.size - 1):
-        members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
+        members, lead, start = _cluster(clusters, c, size)
         n = members.size * size
-        lower = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
-        inverse = np.eye(n)
-        for i in range(n):
-            _solve(lower, inverse[i])
-        _mix(fp, boxes, members, stamps, inverse, mixed)
+        lower = factors[clusters.begin[c] : clusters.begin[c + 1]]
+        diagonal = _mix(fp, boxes, members, lead, start, lower, stamps, mixed)
         for s in members:
             for p in range(fp.first[s], fp.first[s + 1]):
                 for t in range(size):
                     for k in range(fp.size[p]):
-                        at = fp.start[p] + k
-                        h[fp.row[p] * pitch + fp.low[p] + k] += stamps[t, at] * mixed[t, at]
+                        h[at[p] + k] += stamps[t, fp.start[p] + k] * mixed[t, fp.start[p] + k]
         part = np.zeros(n)
         for i in range(n):
             s, t = members[i // size], i % size
             for p in range(fp.first[s], fp.first[s + 1]):
                 for k in range(fp.size[p]):
-                    at = fp.row[p] * pitch + fp.low[p] + k
-                    part[i] += curve[at] * h[at] * stamps[t, fp.start[p] + k]
+                    part[i] += curve[at[p] + k] * h[at[p] + k] * stamps[t, fp.start[p] + k]
             if t == 0:
-                part[i] += inverse[i, i] / flux[s] ** 3
+                part[i] += diagonal[i] / flux[s] ** 3
         if size > 1:
-            g = np.empty((n, n))
-            _gram(fp, boxes, members, stamps, w.weight, pitch, g)
+            g = np.empty(lower.size)
+            _gram(fp, boxes, members, lead, start, stamps, w.weight, at, g)
             for i in range(n):
-                g[i, i] += 1.0 / flux[members[i // size]] ** 2 if i % size == 0 else 1.0 / scatter**2
+                g[start[i] + i] += 1.0 / flux[members[i // size]] ** 2 if i % size == 0 else 1.0 / scatter**2
             for i in range(members.size):
-                own = slice(i * size, (i + 1) * size)
-                _second_derivatives(o, w, drawn, members[i], sigma, mixed, constants, rows, part[own], g[own, own])
-            if _cholesky(g):  # it is positive definite at a maximum; elsewhere H has to do
+                own = part[i * size : (i + 1) * size]
+                _second_derivatives(o, w, drawn, members[i], sigma, mixed, constants, rows, own, i, start, g)
+            if _cholesky(g, lead, start):  # it is positive definite at a maximum; elsewhere H has to do
                 lower = g
-        _solve(lower, part)
+        _solve(lower, lead, start, part)
         for i in range(n):
             s, t = members[i // size], i % size
             z[s, t] = part[i]
-            _draw(fp, s, stamps[t], part[i], pitch, y)
+            _draw(fp, s, stamps[t], part[i], at, y)
             if t > 0:
                 d = shift[s, t - 1]
-                slope += (d * d + inverse[i, i] + 2.0 * part[i] * d) / scatter**3 - 1.0 / scatter
+                slope += (d * d + diagonal[i] + 2.0 * part[i] * d) / scatter**3 - 1.0 / scatter
     for j in range(w.span.shape[0]):
         for p in range(j * pitch + w.span[j, 0] * SEGMENT, j * pitch + (w.span[j, 1] + 1) * SEGMENT):
             if w.flags[p // SEGMENT]:
@@ -988,25 +1089,26 @@ def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
     out[sources, sources] += pixels / background[0] if pixels > 0.0 else 0.0
     known = 0.0
     if free:
+        at = row_starts(fp, pitch)
         for c in range(clusters.first.size - 1):
-            members = clusters.members[clusters.first[c] : clusters.first[c + 1]]
+            members, lead, start = _cluster(clusters, c, templates)
             n = members.size * templates
-            h = factors[clusters.start[c] : clusters.start[c + 1]].reshape(n, n)
-            _gram(fp, boxes, members, stamps, w.weight, pitch, h)
+            h = factors[clusters.begin[c] : clusters.begin[c + 1]]
+            _gram(fp, boxes, members, lead, start, stamps, w.weight, at, h)
             for i in range(n):
-                h[i, i] += 1.0 / fitted[members[i // templates]] ** 2 if i % templates == 0 else 1.0 / scatter**2
-            _cholesky(h)  # positive definite: the prior's curvature is
+                h[start[i] + i] += 1.0 / fitted[members[i // templates]] ** 2 if i % templates == 0 else 1.0 / scatter**2
+            _cholesky(h, lead, start)  # positive definite: the prior's curvature is
             column = np.empty(n)
             for i in range(n):
                 if i % templates > 0:
                     column[:] = 0.0
                     column[i] = 1.0
-                    _solve(h, column)
+                    _solve(h, lead, start, column)
                     known += 2.0 * (scatter**2 - column[i]) ** 2 / scatter**6
             for m in range(size):
                 for i in range(n):
                     column[i] = cross[members[i // templates] * templates + i % templates, m]
-                _solve(h, column)
+                _solve(h, lead, start, column)
                 for k in range(m, size):
                     for i in range(n):
                         out[k, m] -= cross[members[i // templates] * templates + i % templates, k] * column[i]

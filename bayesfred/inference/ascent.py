@@ -3,7 +3,9 @@
 The Fisher information plus the prior's curvature is positive definite everywhere. Newton steps with it in the place of the
 Hessian go far and converge fast where the model fits. Where it does not, they overshoot or crawl; there scipy's BFGS takes
 over, in coordinates in which that matrix is the identity, and learns from gradients alone how the Hessian differs from it.
-Where the map folds there is no density; the search meets the bowl that its start foretells instead.
+Where the map folds there is no density; the search meets the bowl that its start foretells instead. Where a prior ends, a Newton
+step goes to the highest point, within the prior's support, of the paraboloid that it climbs. Where that step vanishes is the
+maximum, inside the support or at its edge, where the gradient points out of it.
 """
 
 from typing import NamedTuple
@@ -31,7 +33,8 @@ class Ascent(NamedTuple):
     covariance : ndarray, shape (d, d)
         Inverse of Fisher information plus prior curvature there.
     distance : float
-        Length of the gradient in standard deviations, that is of a Newton step from there; inf where there is no covariance.
+        Length of a Newton step from there in standard deviations, that of the gradient unless the prior's support ends before;
+        inf where there is no covariance.
     evaluations : int
         Log-posteriors evaluated, with a gradient each.
     """
@@ -51,6 +54,7 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
     J. Nocedal & S. Wright, Numerical Optimization, 2nd ed., chapters 3 and 6.
     """
     params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
+    low, high = posterior.support
     while True:
         information = posterior.information(params)
         scale = 1.0 / np.sqrt(np.diag(information))  # rows differ in scale by many orders of magnitude
@@ -60,24 +64,34 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
             return Ascent(params, value, np.full_like(information, np.nan), np.inf, evaluations)
         whiten = scale[:, None] * linalg.solve_triangular(lower, np.eye(scale.size), lower=True).T
         slope = whiten.T @ posterior.gradient(params)
-        distance = float(np.linalg.norm(slope))
+        step, length = whiten @ slope, slope
+        if np.any(params + step < low) or np.any(params + step > high):
+            bounds = ((low - params) / scale, (high - params) / scale)
+            shares = optimize.lsq_linear(lower.T, slope, bounds, method="bvls").x
+            step, length = scale * shares, lower.T @ shares
+        distance, foretold = float(np.linalg.norm(length)), float(slope @ length - 0.5 * length @ length)
         if distance < CLOSE_ENOUGH or evaluations >= MOST_EVALUATIONS or taken == steps:
             break
-        step, gain, taken = whiten @ slope, -np.inf, taken + 1
+        gain, taken = -np.inf, taken + 1
         for fraction in 0.5 ** np.arange(10):
-            gain = float(posterior.log_prob(params + fraction * step)) - value
+            there = np.clip(params + fraction * step, low, high)
+            gain = float(posterior.log_prob(there)) - value
             evaluations += 1
             if gain > 0.0:
-                params, value = params + fraction * step, value + gain
+                params, value = there, value + gain
                 break
-        if gain > 0.0 and (steps is not None or abs(2.0 * gain / distance**2 - 1.0) < AS_FORETOLD):
+        if gain > 0.0 and (steps is not None or abs(gain / foretold - 1.0) < AS_FORETOLD):
             continue
         if steps is not None:
             break
-        result = _search(posterior, params, value, whiten)
+        inside = np.flatnonzero((low < params) & (params < high))  # the others stay at their bounds in this search
+        lower = linalg.cholesky((information * np.outer(scale, scale))[np.ix_(inside, inside)], lower=True)
+        directions = np.zeros((params.size, inside.size))
+        directions[inside] = scale[inside, None] * linalg.solve_triangular(lower, np.eye(inside.size), lower=True).T
+        result = _search(posterior, params, value, directions)
         evaluations += result.nfev
         if result.fun < 0.0:
-            params, value = params + whiten @ result.x, value - result.fun
+            params, value = params + directions @ result.x, value - result.fun
         elif not gain > 0.0:
             break
     return Ascent(params, float(posterior.log_prob(params)), whiten @ whiten.T, distance, evaluations)
@@ -94,4 +108,4 @@ def _search(posterior: Posterior, origin: Floats, value: float, whiten: Floats) 
         return value - here, -(whiten.T @ posterior.gradient(params))
 
     options = {"gtol": CLOSE_ENOUGH, "norm": 2, "maxiter": 100}
-    return optimize.minimize(cost, np.zeros(origin.size), jac=True, method="BFGS", options=options)
+    return optimize.minimize(cost, np.zeros(whiten.shape[1]), jac=True, method="BFGS", options=options)

@@ -50,7 +50,7 @@ class Chain:
     accepted : ndarray, shape (n_ensembles, n_walkers)
         Moves accepted so far.
     burn_in : int
-        Steps that `draws` leaves out; half of all while the run goes on.
+        Steps that `draws` leaves out; half of all, or more, while the run goes on.
     seed : int
     estimate : MapEstimate
         The maximum that the proposals are centred on.

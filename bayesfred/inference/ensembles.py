@@ -1,10 +1,18 @@
 """Ensembles of walkers: where they start, and their steps, which emcee makes.
 
-What an ensemble may meet is settled here: a log-probability that is no number, walkers that cannot start a run, and walkers that
-are stuck.
+What an ensemble may meet is settled here: a log-probability that is no number, walkers that cannot start a run, walkers that
+are stuck, and proposals that are hardly ever accepted. These are made anew from the draws so far, at a few steps fixed
+beforehand. What they are made of stands in the chain, so that a run that goes on makes the same ones; and from the last
+time on they are fixed, so that the draws after it come from a Markov chain that leaves the posterior alone. The draws before it
+are left out.
+
+References
+----------
+C. Andrieu & J. Thoms (2008), Statistics and Computing 18, 343 (adaptation that ends).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import emcee
@@ -19,6 +27,9 @@ from bayesfred.inference.posterior import Posterior
 Floats = npt.NDArray[np.float64]
 
 DE_SHARE = 0.05  # of the steps move by differential evolution
+POOR = 0.15  # share of accepted moves below which proposals are made anew
+LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which it is looked at, over the latter half of them
+DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be made anew
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
 DEPENDENT = 1e-8  # share of the largest spread, in standard deviations, below which there is none in a direction
 
@@ -123,30 +134,65 @@ def check_start(names: tuple[str, ...], start: Step) -> None:
             )
 
 
-def advance(posterior: Posterior, estimate: MapEstimate, last: Step) -> Iterator[Step]:
+def adapted(chain: Floats) -> int:
+    """Steps after which the proposals in use were made, 0 for those of the Laplace approximation.
+
+    Parameters
+    ----------
+    chain : ndarray, shape (ensembles, steps, walkers, d)
+    """
+    made = 0
+    for look in LOOKS:
+        if look <= chain.shape[1] and np.any(np.diff(chain[:, look // 2 : look], axis=1) != 0.0, axis=3).mean() < POOR:
+            made = look
+    return made
+
+
+def _moves(posterior: Posterior, estimate: MapEstimate, chain: Floats) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves that make the step after those in the chain, each with its share."""
+    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE
+    if made := adapted(chain):
+        draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
+        share = DE_SHARE_ADAPTED
+        with suppress(InputError):  # of too few draws: the next look has more
+            move = LaplaceMove(draws.mean(axis=0), np.cov(draws.T, ddof=0), support=posterior.support)
+    return [(move, 1.0 - share), (emcee.moves.DEMove(live_dangerously=True), share)]
+
+
+def advance(posterior: Posterior, estimate: MapEstimate, start: Step, steps: Sequence[Step] = ()) -> Iterator[Step]:
     """Step all ensembles in turn, without end; a step is one when every ensemble has made it.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    estimate : MapEstimate
+    start : Step
+        From `begin`.
+    steps : sequence of Step
+        Those made already.
 
     Raises
     ------
     InputError
         If walkers are stuck.
     """
-    moves = [
-        (LaplaceMove.of(posterior, estimate), 1.0 - DE_SHARE),
-        (emcee.moves.DEMove(live_dangerously=True), DE_SHARE),
-    ]
+    past, last = [step.coords for step in steps], steps[-1] if steps else start
     log_prob = _LogProb(posterior, last.n_invalid)
-    _, walkers, d = last.coords.shape
-    generators = []
-    for state in last.states():
-        sampler = emcee.EnsembleSampler(walkers, d, log_prob, moves=moves, vectorize=True)
-        sampler.log_prob_fn = log_prob  # emcee's wrapper would print a traceback when interrupted
-        generators.append(sampler.sample(state, iterations=None, store=False, skip_initial_state_check=True))
+    ensembles, walkers, d = last.coords.shape
+    generators: list[Iterator[emcee.State]] = []
     idle = np.zeros(last.log_prob.shape, np.int64)  # steps since each walker moved
     while True:
+        if not generators or len(past) in LOOKS:
+            moves = _moves(posterior, estimate, np.array(past).reshape(-1, ensembles, walkers, d).swapaxes(0, 1))
+            generators = []
+            for state in last.states():
+                sampler = emcee.EnsembleSampler(walkers, d, log_prob, moves=moves, vectorize=True)
+                sampler.log_prob_fn = log_prob  # emcee's wrapper would print a traceback when interrupted
+                generators.append(sampler.sample(state, iterations=None, store=False, skip_initial_state_check=True))
         states = [next(generator) for generator in generators]
         moved = np.stack([np.any(state.coords != before, axis=1) for state, before in zip(states, last.coords, strict=True)])
         last = Step.of(states, last.accepted + moved, log_prob.n_invalid)
+        past.append(last.coords)
         yield last
         idle = np.where(moved, 0, idle + 1)
         longest = int(idle.max())

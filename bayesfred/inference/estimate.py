@@ -49,7 +49,8 @@ class MapEstimate:
     message : str
         How the search ended and where it began; what to do where it has not converged.
     at_maximum : bool
-        Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits.
+        Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits; of parameters at a bound of
+        their prior it may point out of the support.
     """
 
     params: Floats
@@ -166,6 +167,9 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
     message = f"gradient {top.distance:.1g} standard deviations from zero after {top.evaluations} evaluations{how}"
+    bounds = zip(posterior.parameter_names, top.params, *posterior.support, strict=True)
+    if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
+        message += f", {', '.join(at_bound)} at a bound of the prior"
     if not at_maximum:
         message = f"not found, {message}: begin elsewhere (start), fit fewer terms, or narrow the priors"
     elif not abs(excess) <= CONSISTENT:

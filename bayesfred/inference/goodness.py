@@ -39,6 +39,7 @@ from bayesfred.inference.posterior import Posterior
 
 SERIES_FROM = 1e3
 SMALL_UNTIL = 1e-6
+BLOCK = 2**16  # pixels
 
 
 def deviance_moments(
@@ -119,12 +120,15 @@ def goodness(posterior: Posterior, params: NDArray[np.float64]) -> dict[str, Any
     shift = posterior.noise.read_noise**2
     n, mu = n + shift, mu + shift
     with np.errstate(all="ignore"):  # a mean of zero makes a statistic infinite, which is its value
-        mean, variance, slope = deviance_moments(mu)
+        sums = np.zeros(6)
+        for first in range(0, n.size, BLOCK):  # whole frames of intermediate numbers would not fit the caches, or the memory
+            some, here = n[first : first + BLOCK], mu[first : first + BLOCK]
+            pearson, deviance = (some - here) ** 2 / here, 2.0 * (xlogy(some, np.maximum(some, 0.0) / here) - some + here)
+            sums += [np.sum(part) for part in (pearson, deviance, *deviance_moments(here), 1.0 / here)]
+        fit["pearson"], fit["deviance"], mean, variance, slope, inverse = sums.tolist()
         # a fitted background removes the part that is linear in the counts: see the head of the module
-        left = np.sum(variance) - np.sum(slope) ** 2 / np.sum(1.0 / mu)
-        fit["pearson"] = float(np.sum((n - mu) ** 2 / mu))
-        fit["deviance"] = float(np.sum(2.0 * (xlogy(n, np.maximum(n, 0.0) / mu) - n + mu)))
+        left = variance - slope**2 / np.float64(inverse)
     return fit | {
-        "deviance_expected": float(np.sum(mean)) - fit["n_fitted"],
+        "deviance_expected": mean - fit["n_fitted"],
         "deviance_sd": float(np.sqrt(left)),
     }

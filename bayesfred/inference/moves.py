@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from emcee.moves import RedBlueMove
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln, logsumexp, ndtr
+from scipy.stats import norm, truncnorm
 
 from bayesfred.errors import InputError
 from bayesfred.inference.estimate import MapEstimate, inverse
@@ -24,6 +25,8 @@ DEGREES_OF_FREEDOM = 5.0
 
 NESTED = 30  # at most so many approximations to either side
 NEGLIGIBLE = 7.0  # in log weight below the largest: e^-7 = 1e-3
+
+NEAR = 6.0  # standard deviations from the mean within which a bound of the prior counts
 
 
 class LaplaceMove(RedBlueMove):  # type: ignore[misc]
@@ -40,6 +43,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
 
     Several approximations make q a mixture of such densities: see `of`.
 
+    Where a prior ends near m, the parameters concerned are drawn one after the other, before the others, from what the support
+    leaves of their normal distribution given those before: x = m + L z with L lower triangular, and z_i a normal variable cut
+    to an interval that depends on z_1 to z_(i-1). That divides the normal density by the product of the intervals' masses.
+
     Parameters
     ----------
     mean : ndarray, shape (d,) or (k, d)
@@ -48,6 +55,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         C, the Laplace approximation's covariance.
     weights : array_like, shape (k,), optional
         Shares of the approximations; they sum to 1.
+    support : tuple of ndarray, shape (d,), optional
+        Least and largest values that the prior admits.
 
     Raises
     ------
@@ -57,7 +66,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     References
     ----------
     L. Tierney (1994), Annals of Statistics 22, 1701, Section 2.3.4 (independence chains). T. Hesterberg (1995),
-    Technometrics 37, 185 (defensive mixtures).
+    Technometrics 37, 185 (defensive mixtures). A. Genz (1992), J. Comp. Graph. Stat. 1, 141 (variables cut one after the other).
 
     Examples
     --------
@@ -67,14 +76,27 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     ((3, 1), (3,))
     """
 
-    def __init__(self, mean: Floats, covariance: Floats, weights: npt.ArrayLike = (1.0,)) -> None:
+    def __init__(
+        self,
+        mean: Floats,
+        covariance: Floats,
+        weights: npt.ArrayLike = (1.0,),
+        support: tuple[npt.ArrayLike, npt.ArrayLike] = (-np.inf, np.inf),
+    ) -> None:
         super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
-        self.means = np.atleast_2d(mean)
-        d = self.means.shape[1]
+        means = np.atleast_2d(mean)
+        d = means.shape[1]
+        low, high = (np.broadcast_to(bound, d) for bound in support)
         try:
-            self.lowers = np.array([cholesky(c, lower=True) for c in np.reshape(covariance, (-1, d, d))])
+            covariances = np.reshape(covariance, (-1, d, d))
+            reach = NEAR * np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
+            near = np.any((means - low < reach) | (high - means < reach), axis=0)
+            self.order = np.argsort(~near, kind="stable")  # parameters near a bound first
+            self.lowers = np.array([cholesky(c[np.ix_(self.order, self.order)], lower=True) for c in covariances])
         except (LinAlgError, ValueError):
             raise InputError("estimate: got no positive definite covariance, expected the maximum's: see find_map") from None
+        self.bounds = np.stack([low, high], axis=1)[near]
+        self.means = means[:, self.order]
         self.weights = np.asarray(weights, dtype=np.float64)
 
     @classmethod
@@ -93,7 +115,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         H. Rue, S. Martino & N. Chopin (2009), JRSS B 71, 319, Section 3.
         """
         if not posterior.nuisances.position_scatter:
-            return cls(estimate.params, estimate.covariance)
+            mean = estimate.params
+            if np.any((mean <= posterior.support[0]) | (mean >= posterior.support[1])):  # the paraboloid's top is outside
+                mean = mean + estimate.covariance @ posterior.gradient(mean)
+            return cls(mean, estimate.covariance, support=posterior.support)
         j = posterior.parameter_names.index("position_scatter")
         rest = np.arange(estimate.params.size) != j
         ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
@@ -112,7 +137,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
                 means.append(mean)
                 covariances.append(covariance)
                 logs.append(log)
-        return cls(np.array(means), np.array(covariances), np.exp(np.array(logs) - logsumexp(logs)))
+        return cls(np.array(means), np.array(covariances), np.exp(np.array(logs) - logsumexp(logs)), posterior.support)
 
     def draw(self, n: int, random: np.random.RandomState) -> Floats:
         """n draws from the proposal, shape (n, d)."""
@@ -120,8 +145,18 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         z = random.standard_normal((n, self.means.shape[1]))
         stretch = np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, n))
         heavy = random.random_sample(n) < HEAVY_SHARE
+        for i in range(len(self.bounds)):
+            a, b = self._interval(i, self.means[k], self.lowers[k], z)
+            z[:, i] = np.where(heavy, z[:, i], truncnorm.ppf(ndtr(z[:, i]), a, b))
         z *= np.where(heavy, stretch, 1.0)[:, None]
-        return np.asarray(self.means[k] + np.einsum("nij,nj->ni", self.lowers[k], z))
+        x = np.empty_like(z)
+        x[:, self.order] = self.means[k] + np.einsum("nij,nj->ni", self.lowers[k], z)
+        return x
+
+    def _interval(self, i: int, means: Floats, lowers: Floats, z: Floats) -> Floats:
+        """Where the i-th of the parameters near a bound keeps z_i, given those before it: both ends, shape (2, n)."""
+        given = means[..., i] + np.einsum("...j,...j->...", lowers[..., i, :i], z[:, :i])
+        return np.asarray((self.bounds[i][:, None] - given) / lowers[..., i, i])
 
     def log_density(self, x: Floats) -> Floats:
         """log q at x, shape (n, d)."""
@@ -129,8 +164,11 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         peak = gammaln(0.5 * (nu + d)) - gammaln(0.5 * nu) - 0.5 * d * np.log(nu * np.pi)
         parts = []
         for mean, lower, weight in zip(self.means, self.lowers, self.weights, strict=True):
-            squared = (solve_triangular(lower, (x - mean).T, lower=True) ** 2).sum(axis=0)
+            z = solve_triangular(lower, (x[:, self.order] - mean).T, lower=True).T
+            squared = (z**2).sum(axis=1)
             normal = np.log1p(-HEAVY_SHARE) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
+            for i in range(len(self.bounds)):
+                normal += truncnorm.logpdf(z[:, i], *self._interval(i, mean, lower, z)) - norm.logpdf(z[:, i])
             student = np.log(HEAVY_SHARE) + peak - 0.5 * (nu + d) * np.log1p(squared / nu)
             parts.append(np.logaddexp(normal, student) + np.log(weight) - np.log(np.diag(lower)).sum())
         return np.asarray(logsumexp(parts, axis=0))

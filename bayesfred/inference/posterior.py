@@ -274,8 +274,12 @@ class Posterior:
     def default_prior(self, name: str) -> Any:
         """The prior that a parameter has unless another is given."""
         m = self.model
-        level = max(float(np.mean(self.counts[self.mask])), 1.0 / self.mask.sum())
-        return priors.default_prior(name, m.distortion, m.detector, level, m.psf.sigma)
+        return priors.default_prior(name, m.distortion, m.detector, self._level, m.psf.sigma)
+
+    @cached_property
+    def _level(self) -> float:
+        """Mean counts per pixel, at least one in the frame."""
+        return max(float(np.mean(self.counts[self.mask])), 1.0 / float(self.mask.sum()))
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
@@ -330,6 +334,12 @@ class Posterior:
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
         return self._log_prior(self._vectors(params))
+
+    @cached_property
+    def support(self) -> tuple[Floats, Floats]:
+        """The least and the largest value that the prior admits of every parameter, shape (d,) each."""
+        low, high = np.array([distribution.support() for distribution in self.prior.values()]).T
+        return low, high
 
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
@@ -419,7 +429,8 @@ class Posterior:
         with self._drawn(arguments) as (w, drawn):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
         u, v = (np.arange(1 - n, n, 2) / n for n in (nx, ny))
-        background = np.polynomial.polynomial.polyval2d(*np.meshgrid(u, v), _square(arguments[2]))
+        order = self.nuisances.background_order + 1
+        background = np.polynomial.polynomial.polygrid2d(u, v, _square(arguments[2])[:order, :order]).T
         bad = 0.0 if drawn.extra > -np.inf else np.nan
         return sources + background - self.noise.shift + bad, drawn.fitted.fluxes + bad
 
@@ -459,8 +470,8 @@ class Posterior:
         try:
             workspace = self._workspaces.get_nowait()
         except queue.Empty:
-            ny, nx = self.model.detector.shape
-            workspace = _kernels.new_workspace(ny, stride(nx))
+            typical = self._arguments(self.start()[None])[1][0]
+            workspace = _kernels.new_workspace(self._optics, typical, self._free)
         yield workspace
         self._workspaces.put(workspace)
 

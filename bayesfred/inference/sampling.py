@@ -1,7 +1,8 @@
 """Drawing from the posterior: independent emcee ensembles, run side by side until their draws suffice.
 
 Every ensemble starts from draws of the Laplace approximation and moves by `LaplaceMove`, now and then by differential
-evolution. After growing numbers of steps the rank-normalised R-hat between ensembles and the effective sample sizes
+evolution. Where too few moves are accepted the proposals are made anew from the draws so far, which are then left out, see
+`ensembles.py`. After growing numbers of steps the rank-normalised R-hat between ensembles and the effective sample sizes
 are computed; the run ends when they meet the target. The chain stays in memory, and a checkpoint replaces the file, every
 half minute and at the end, so that a run that was stopped goes on where it was.
 """
@@ -28,7 +29,7 @@ from threadpoolctl import threadpool_limits
 from bayesfred.errors import InputError
 from bayesfred.inference.chainfile import Chain, check_same_posterior, open_chain, random_states, write_chain
 from bayesfred.inference.convergence import convergence
-from bayesfred.inference.ensembles import Step, advance, begin, check_start
+from bayesfred.inference.ensembles import Step, adapted, advance, begin, check_start
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.lock import only_writer
 from bayesfred.inference.posterior import Posterior
@@ -138,22 +139,23 @@ def _check_numbers(ensembles: int, walkers: int, target_ess: float, steps: int |
 
 
 def burn_in(chain: Floats) -> int:
-    """Steps to leave out, at most half the run.
+    """Steps to leave out: those before the proposals were made for the last time, and of the others at most half.
 
     Walkers start from the Laplace approximation, so what must be forgotten is its difference from the posterior. Were the slowest
     parameter's correlations r^k after k steps, its autocorrelation time would be tau = (1 + r)/(1 - r); the steps are those
     after which a twentieth is left, r^k = 1/20.
     """
-    n_steps = chain.shape[1]
-    kept = chain[:, n_steps // 4 :]
+    made: int = min(adapted(chain), chain.shape[1] - 1)
+    n_steps: int = chain.shape[1] - made
+    kept = chain[:, made + n_steps // 4 :]
     _, bulk, tail = convergence(kept)
     effective = float(min(bulk.min(), tail.min()))
     draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
-    half: int = n_steps // 2
+    half = n_steps // 2
     if not effective * half > draws:  # tau is longer
-        return half
+        return made + half
     tau = max(draws / effective, 1.1)
-    return min(half, math.ceil(math.log(20.0) / math.log((tau + 1.0) / (tau - 1.0))))
+    return made + min(half, math.ceil(math.log(20.0) / math.log((tau + 1.0) / (tau - 1.0))))
 
 
 def versions() -> dict[str, str]:
@@ -232,7 +234,7 @@ class _Run:
 
     def _advance(self, total: int) -> Iterator[None]:
         """Make steps until there are so many."""
-        steps = advance(self.posterior, self.estimate, self.steps[-1] if self.steps else self.start)
+        steps = advance(self.posterior, self.estimate, self.start, self.steps)
         while len(self.steps) < total:
             self.steps.append(next(steps))  # all of a step or nothing, wherever an interrupt comes
             yield
@@ -258,7 +260,7 @@ class _Run:
             chain,
             log_prob,
             steps[-1].accepted,
-            len(steps) // 2,
+            max(len(steps) // 2, min(adapted(chain), len(steps) - 1)),
             self.seed,
             self.estimate,
             versions(),

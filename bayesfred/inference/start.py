@@ -98,8 +98,10 @@ def find_start(posterior: Posterior) -> Start:
     field = Field(posterior)
     plain = posterior.start()
     plain[field.columns] = field.centre
+    plain = np.clip(plain, *posterior.support)
     params = plain.copy()
     params[field.columns] = z
+    params = np.clip(params, *posterior.support)
     params = _unfolded(posterior, params, plain)
     if not np.isfinite(posterior.log_prob(params)):
         return Start(plain, "the prior's medians", matched)
@@ -141,7 +143,7 @@ def find_peaks(posterior: Posterior) -> Floats:
     detector = posterior.model.detector
     step = detector.binning
     width = np.hypot(posterior.model.psf.sigma / step, 12.0**-0.5)
-    block = max(1, int(width / 1.5))
+    block = max(1, min(int(width / 1.5), min(detector.shape) // 3))
     s = max(np.sqrt(width**2 + (block**2 - 1) / 12.0) / block, 1.0)
     ny, nx = (n // block for n in detector.shape)
 
@@ -177,9 +179,13 @@ def _alone(model: ForwardModel) -> Flags:
     neighbours with r times a source's flux at the vectors d displace its peak by the sum of r d (1 - q/2) exp(-q).
     """
     s = model.sources
-    d = np.stack([s.x - s.x[:, None], s.y - s.y[:, None]])
-    q = (d**2).sum(axis=0) / (4.0 * model.psf.sigma**2)
-    shift = (d * (1.0 - 0.5 * q) * np.exp(-q) * s.flux / s.flux[:, None]).sum(axis=2)
+    place = np.stack([s.x, s.y], axis=1)
+    pairs = spatial.cKDTree(place).query_pairs(12.0 * model.psf.sigma, output_type="ndarray")  # exp(-36) is nothing
+    source, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    d = place[other] - place[source]
+    q = (d**2).sum(axis=1) / (4.0 * model.psf.sigma**2)
+    each = d.T * (1.0 - 0.5 * q) * np.exp(-q) * s.flux[other] / s.flux[source]
+    shift = [np.bincount(source, along, len(s)) for along in each]
     return np.asarray(np.hypot(*shift) < CROWDED * model.psf.sigma)
 
 

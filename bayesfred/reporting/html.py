@@ -45,6 +45,8 @@ class _Row:
     ess_bulk: str
     ess_tail: str
     tau: str
+    prior: str
+    likelihood: str
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ def write_report(
         title=title,
         diagnostics=diagnostics,
         rows=_rows(chain, diagnostics, draws, truth),
+        prior_dominated=Markup(", ").join(_symbol(name) for name in diagnostics.prior_dominated),
         has_truth=truth is not None,
         statistics=_statistics(diagnostics),
         figures=_figures(chain, posterior, draws, truth),
@@ -140,6 +143,8 @@ def _rows(chain: Chain, diagnostics: Diagnostics, draws: Floats, truth: Floats |
                 f"{diagnostics.ess_bulk[name]:.0f}",
                 f"{diagnostics.ess_tail[name]:.0f}",
                 f"{diagnostics.tau[name]:.2f}",
+                f"{diagnostics.prior_sensitivity[name]:.3f}",
+                f"{diagnostics.likelihood_sensitivity[name]:.3f}",
             )
         )
     return rows
