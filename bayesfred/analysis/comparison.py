@@ -17,10 +17,9 @@ T. Sivula, M. Magnusson, A. Vehtari (2020), arXiv:2008.10296: what a difference 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
 from bayesfred.errors import InputError
@@ -31,8 +30,6 @@ from bayesfred.inference.posterior import Posterior
 __all__ = ["Comparison", "Score", "compare"]
 
 Floats = NDArray[np.float64]
-
-_loo: Any = array_stats.loo
 
 # Pixels whose log-likelihood varies by less over the draws need no smoothing.
 SPREAD = 0.5
@@ -181,7 +178,7 @@ def _leave_one_out(posterior: Posterior, chain: Chain, n_draws: int) -> tuple[Fl
         values = np.stack([value[part] for value in _log_likelihoods(posterior, draws)], axis=-1)
         if part.size:
             with np.errstate(all="ignore"):  # a tail of draws that are all alike has no shape: NaN, which is not reliable
-                elpd[part], shape[part], p = _loo(values, chain_axis=None, draw_axis=-1, r_eff=r_eff)
+                elpd[part], shape[part], p = array_stats.loo(values, chain_axis=None, draw_axis=-1, r_eff=r_eff)
             seen[part] = elpd[part] + p
     limit = min(1.0 - 1.0 / math.log10(len(draws)), 0.7)
     return elpd, float(np.sum(seen - elpd)), float(shape.max()), int(np.sum(~(shape <= limit)))
