@@ -1,4 +1,5 @@
 from . import runs
+from .analysis.comparison import Comparison, compare
 from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.sbc import PosteriorCalibration, calibrate_posterior
 from .analysis.study import NoiseStudy, noise_study
@@ -19,6 +20,7 @@ from .inference.sampling import sample
 __all__ = [
     "BackgroundNoise",
     "Chain",
+    "Comparison",
     "Detector",
     "Diagnostics",
     "ForwardModel",
@@ -37,6 +39,7 @@ __all__ = [
     "SampledPSF",
     "SourceCatalog",
     "calibrate_posterior",
+    "compare",
     "correct_sampling",
     "diagnose",
     "find_map",

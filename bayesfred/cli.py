@@ -98,6 +98,14 @@ def report(
 
 
 @app.command()
+def compare(
+    chain_files: Annotated[list[Path], typer.Argument(metavar="A.h5 B.h5 ...", help="Chains of one frame.", show_default=False)],
+) -> None:
+    """Rank models of one frame by how well they predict every pixel from the others."""
+    _run(lambda: bf.runs.compare(chain_files).reliable)
+
+
+@app.command()
 def verify(
     chain_file: ChainFile,
     every_draw: Annotated[bool, typer.Option("--all", help="Every draw's log-probability, not 1,000 of them.")] = False,

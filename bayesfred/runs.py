@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bayesfred import assembly, files, settings
-from bayesfred.analysis import tasks
+from bayesfred.analysis import comparison, tasks
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.analysis.study import VARIABLES, NoiseStudy, noise_study
@@ -34,8 +34,8 @@ PathLike = str | os.PathLike[str]
 
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian PSF of 10 pixels. The "
-    "coefficients are those of its Table 2, read with g in y and the columns in the order u2x, v2x, ux, vx, ux2, vx2: the "
-    "reading in which the paper's results are possible."
+    "coefficients are those of its Table 2, read with g in y and the columns in the order u2x, v2x, ux, vx, ux2, vx2: one of the "
+    "readings in which the paper's results are possible."
 )
 
 
@@ -324,6 +324,43 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> bool:
     if others:
         print(f"made with {', '.join(others)}")
     return all(check.holds for check in checks)
+
+
+def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
+    """Rank models of one frame by leave-one-out predictive accuracy, and print the ranking as a table.
+
+    Parameters
+    ----------
+    chain_files : sequence of path-like
+        At least two.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If a chain cannot be read, is named twice, or the models cannot be compared.
+    """
+    paths = [Path(file) for file in chain_files]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise InputError(f"{path}: got it twice, expected chains of different models: name each once")
+    compared = comparison.compare({str(path): open_chain(path) for path in paths})
+    table = Table("model", "parameters", "elpd", "p_loo", "behind the best", "Pareto k")
+    for score in compared.scores:
+        behind = f"{score.difference:.1f} +- {score.difference_se:.1f}" if score is not compared.scores[0] else ""
+        shape = f"{score.pareto_k:.2f}" if np.isfinite(score.pareto_k) else ""
+        table.add_row(
+            escape(printable(score.name)), str(score.n_parameters), f"{score.elpd:.1f} +- {score.elpd_se:.1f}",
+            f"{score.p_loo:.1f}", behind, shape,
+        )  # fmt: skip
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    print(f"chosen: {printable(compared.chosen)}, the one with the fewest parameters that predicts as well as the best")
+    if not compared.reliable:
+        print("not reliable: pixels whose weights have too heavy a tail (Pareto k), which single draws decide: look for bad pixels")
+    return compared
 
 
 def _output(run: settings.RunSettings, run_file: Path) -> Path:

@@ -429,7 +429,7 @@ def test_public_names_are_documented(name: str) -> None:
     assert undocumented(SOURCES[defined_in(name)], name) == []
 
 
-@pytest.mark.parametrize("name", ["demo", "fit", "report", "simulate_frame", "study", "verify"])
+@pytest.mark.parametrize("name", ["compare", "demo", "fit", "report", "simulate_frame", "study", "verify"])
 def test_runs_are_documented(name: str) -> None:
     assert undocumented(SOURCES["bayesfred.runs"], name) == []
 

@@ -342,7 +342,7 @@ def test_example_in_help_is_a_run_file(tmp_path: Path) -> None:
 
 def test_every_command_is_explained(tmp_path: Path) -> None:
     listed = invoke(tmp_path, "--help").stdout
-    for name in ("demo", "simulate", "fit", "report", "verify"):
+    for name in ("demo", "simulate", "fit", "report", "compare", "verify"):
         assert re.search(rf"^\s+{name}\s+\w", listed, re.M)
         assert invoke(tmp_path, name, "--help").code == 0
 
