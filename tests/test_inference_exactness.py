@@ -130,7 +130,7 @@ def steps_of(target: Target, moves: Any, seed: int) -> Steps:
     sampler = emcee.EnsembleSampler(*coords.shape, target.log_prob, moves=moves, vectorize=True)
     start = emcee.State(coords, random_state=np.random.RandomState(seed + 1).get_state())
     for state in sampler.sample(start, iterations=MOST_STEPS, store=False, skip_initial_state_check=True):
-        yield state.coords
+        yield state.coords.copy()  # emcee writes the next step over it
 
 
 def stand_ins(target: Target) -> tuple[Any, MapEstimate]:

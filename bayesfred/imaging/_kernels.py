@@ -38,6 +38,7 @@ inner = partial(nb.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 LANES = 8  # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
 LOG2_E = 1.4426950408889634
 BATCH = 32  # sources whose rows are listed at a time: of many sources the list would outgrow the caches
+CORE = 2.0  # widths of the PSF about a source's image within which its map must not fold
 SEGMENT = 16  # pixels that are marked together as reached by a source
 
 
@@ -277,8 +278,8 @@ def _multiply(a, b, conserve, q, d):
 
 
 @inner(cache=True)
-def _reach(o, a, b, u, v, radius, bounds, stack):
-    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius, -1 if D <= 0 on one of them.
+def _reach(o, a, b, u, v, radius, core, bounds, stack):
+    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius, -1 if D <= 0 where it is <= core.
 
     With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2 of
     |c_mn| |d|^(m + n). On the ellipse |J d| = R' one has |d| <= R'/s, s the smaller singular value of J, hence
@@ -310,7 +311,7 @@ def _reach(o, a, b, u, v, radius, bounds, stack):
             reach = radius + rest
             if reach > 4.0 * radius:
                 break
-    reach = _survey(o, a, b, u, v, radius, bounds, stack)
+    reach = _survey(o, a, b, u, v, radius, core, bounds, stack)
     return reach + margin if reach >= 0.0 else -1.0
 
 
@@ -324,8 +325,8 @@ def _rest(bounds, d):
 
 
 @inner(cache=True)
-def _survey(o, a, b, u, v, radius, bounds, stack):
-    """The largest |J d| in the frame where |(a, b)| <= radius, at most; -1 if D <= 0 there.
+def _survey(o, a, b, u, v, radius, core, bounds, stack):
+    """The largest |J d| in the frame where |(a, b)| <= radius, at most; -1 if D <= 0 where |(a, b)| <= core.
 
     The frame is halved along both axes and so are its parts, unless they lie beyond the radius: at distance r from
     a part's middle (a, b) differs from its value there by at most |J| r + M r^2 / 2, M = sum of |c_mn| k (k - 1) |d|^(k - 2),
@@ -349,7 +350,7 @@ def _survey(o, a, b, u, v, radius, bounds, stack):
         if here > radius + r * (math.sqrt(a_u * a_u + a_v * a_v + b_u * b_u + b_v * b_v) + 0.5 * bend * r):
             continue
         if max(half_t, half_w) <= radius / 12.0:
-            if here <= radius and a_u * b_v - a_v * b_u <= 0.0:
+            if here <= core and a_u * b_v - a_v * b_u <= 0.0:
                 return -1.0
             for i in range(4):
                 t_i, w_i = t + (half_t if i % 2 else -half_t), w + (half_w if i < 2 else -half_w)
@@ -365,7 +366,7 @@ def _survey(o, a, b, u, v, radius, bounds, stack):
 
 @inner(cache=True)
 def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
-    """Fill `maps`; False where a source has no image, or is seen where D <= 0: the map folds.
+    """Fill `maps`; False where a source has no image, or the map folds (D <= 0) within two of the PSF's widths of one.
 
     Windows hold the pixels above the tolerance, and those above it once a source moves by up to `margin` in (a, b).
     """
@@ -376,7 +377,7 @@ def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
         a = maps.a[s]
         b = maps.b[s]
         u, v, ok = _find_peak(o, s, theta, offset_x, offset_y, a, b)
-        reach = _reach(o, a, b, u, v, radius, bounds, stack) if ok else math.inf
+        reach = _reach(o, a, b, u, v, radius, CORE * sigma, bounds, stack) if ok else math.inf
         unfolded = unfolded and ok and reach >= 0.0
         _multiply(a, b, len(o.d_degree) > 0, maps.q[s], maps.d[s])
         maps.peak[s, 0] = u

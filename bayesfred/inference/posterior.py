@@ -210,7 +210,7 @@ class Posterior:
     counts : array_like, shape (ny, nx), counts
     prior : mapping of str to frozen scipy.stats distribution, optional
         By parameter name; the others get `priors.default_prior`. Parameters are independent a priori. A distortion that
-        leaves a source without an image, or folds the frame where the source is seen (D <= 0), has probability zero.
+        leaves a source without an image, or folds the frame (D <= 0) within two of the PSF's widths of one, has probability zero.
     noise : PoissonNoise or BackgroundNoise
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is to be used.
