@@ -136,7 +136,13 @@ def steps_of(target: Target, moves: Any, seed: int) -> Steps:
 def stand_ins(target: Target) -> tuple[Any, MapEstimate]:
     """Posterior and estimate, as far as the ensembles ask for them."""
     d = len(target.first)
-    posterior = SimpleNamespace(unchecked_log_prob=target.log_prob, log_prob=target.log_prob, n_parameters=d, nuisances=Nuisances())
+    posterior = SimpleNamespace(
+        unchecked_log_prob=target.log_prob,
+        log_prob=target.log_prob,
+        n_parameters=d,
+        nuisances=Nuisances(),
+        support=(np.full(d, -np.inf), np.full(d, np.inf)),
+    )
     return posterior, MapEstimate(target.mean, target.covariance, 0.0, True, 0, "")
 
 
