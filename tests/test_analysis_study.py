@@ -596,7 +596,7 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
     assert "calibrated: 10 frames" in capsys.readouterr().out
     assert len(files.read_table("chains/run.sbc.summary.ecsv").columns["quantity"]) == 10
     assert not study("replicates = 2\npath = 'faint.ecsv'\n[prior.f_ux]\ndistribution = 'norm'\nloc = -0.5\n", kind="sbc")
-    assert "not calibrated: no posterior of 2 frames (prior: " in capsys.readouterr().out
+    assert "not calibrated: no posterior of 2 frames (start: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import io
 import math
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -21,6 +22,7 @@ from test_inference import (
     make_truth,
 )
 
+from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -31,6 +33,7 @@ from bayesfred.inference import priors
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.inference.posterior import Nuisances, Posterior
+from bayesfred.inference.sampling import sample
 
 Floats = NDArray[np.float64]
 
@@ -271,3 +274,22 @@ def test_start_has_density(level: float) -> None:
         for nuisances in (EVERYTHING, Nuisances("free")):
             posterior = Posterior(model, frame, noise=noise, nuisances=nuisances)
             assert math.isfinite(posterior.log_prob(posterior.start()))
+
+
+def test_a_frame_without_background_is_fitted_and_sampled(tmp_path: Path) -> None:
+    """Its background's posterior is an exponential distribution, whose rate is how much of the frame no source outshines."""
+    sources = SourceCatalog([-5.0, -5.0, 5.0, 5.0], [-5.5, 4.5, -5.5, 4.5], np.full(4, 5e3))
+    distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
+    model = ForwardModel(Detector((24, 24)), sources, GaussianPSF(1.5), distortion)
+    posterior = Posterior(model, simulate(model, [0.0, 0.0], 1e-9, seed=2))
+    best = find_map(posterior)
+    assert best.at_maximum and best.params[2] < 1e-4
+    chain = sample(posterior, best, path=tmp_path / "chain.h5", seed=1, progress=False)
+    assert diagnose(chain).converged
+    # the marginal likelihood of the background, the distortion being known well
+    level = np.linspace(0.0, 0.2, 2001)[1:]
+    density = posterior.log_prob(np.column_stack([np.tile(best.params[:2], (level.size, 1)), level]))
+    weight = np.exp(density - density.max())
+    mean = float(level @ weight / weight.sum())
+    sd = float(np.sqrt((level - mean) ** 2 @ weight / weight.sum()))
+    assert abs(chain.draws()[:, 2].mean() - mean) < 4.0 * sd / np.sqrt(1000.0)

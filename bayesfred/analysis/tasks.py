@@ -165,7 +165,12 @@ def _answers(study: Study, key: str, todo: deque[int], executor: Executor) -> It
     workers: set[str] = set()
 
     def send(k: int, with_study: bool) -> None:
-        future = executor.submit(answer, key, study if with_study else None, k)
+        # a process that begins here must not meet a Ctrl-C before it has learnt to leave it to this one
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            future = executor.submit(answer, key, study if with_study else None, k)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         waiting.add(future)
         future.add_done_callback(lambda done: finished.put((k, done)))
 

@@ -56,14 +56,15 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
     params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
     low, high = posterior.support
     while True:
-        information = posterior.information(params)
+        gradient = posterior.gradient(params)
+        information = _information(posterior, params, gradient)
         scale = 1.0 / np.sqrt(np.diag(information))  # rows differ in scale by many orders of magnitude
         try:
             lower = linalg.cholesky(information * np.outer(scale, scale), lower=True)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
             return Ascent(params, value, np.full_like(information, np.nan), np.inf, evaluations)
         whiten = scale[:, None] * linalg.solve_triangular(lower, np.eye(scale.size), lower=True).T
-        slope = whiten.T @ posterior.gradient(params)
+        slope = whiten.T @ gradient
         step, length = whiten @ slope, slope
         if np.any(params + step < low) or np.any(params + step > high):
             bounds = ((low - params) / scale, (high - params) / scale)
@@ -95,6 +96,22 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
         elif not gain > 0.0:
             break
     return Ascent(params, float(posterior.log_prob(params)), whiten @ whiten.T, distance, evaluations)
+
+
+def _information(posterior: Posterior, params: Floats, gradient: Floats) -> Floats:
+    """Fisher information plus prior curvature, as far as it describes the posterior where a prior's support ends.
+
+    Where the background has no counts, the log-posterior falls linearly from its edge, while the information about it has no bound.
+    A fall by exp(-g x) has the standard deviation 1/g; it stands for information that foretells less.
+    """
+    information = posterior.information(params)
+    known = np.diag(information).copy()
+    room = np.where(gradient < 0.0, params - posterior.support[0], posterior.support[1] - params)  # towards which it climbs
+    for k in np.flatnonzero((room * np.sqrt(known) <= 1.0) | (room <= 0.0)):
+        if known[k] > gradient[k] ** 2 > 0.0:
+            information[k], information[:, k] = 0.0, 0.0
+            information[k, k] = gradient[k] ** 2
+    return information
 
 
 def _search(posterior: Posterior, origin: Floats, value: float, whiten: Floats) -> optimize.OptimizeResult:

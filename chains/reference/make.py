@@ -35,7 +35,7 @@ def posterior(name: str, **model: Any) -> bf.Posterior:
     made, _ = assembly.simulated(run, path, run.simulation.seed)
     changed = run.model_copy(update={"model": run.model.model_copy(update=model)})
     sources, shape = made.model.sources, made.model.detector.shape
-    return assembly.posterior_given(changed, assembly.forward_model(changed, shape, sources), made.counts, None)
+    return assembly.posterior_given(changed, assembly.forward_model(changed, shape, sources, made.model.psf), made.counts, None)
 
 
 def counts_hash(counts: Floats) -> str:
