@@ -16,6 +16,7 @@ import os
 import re
 import reprlib
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -539,6 +540,8 @@ def within(folder: str | Path, path: str | Path, where: str) -> Path:
     place = Path(folder) / path
     try:
         inside = place.resolve().is_relative_to(Path(folder).resolve())
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            os.stat(place)  # from Python 3.13 on `resolve` does not mind a loop of links
     except (OSError, RuntimeError, ValueError):  # a loop of links, a name too long, a zero byte
         inside = False
     if not inside:

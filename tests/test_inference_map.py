@@ -293,3 +293,16 @@ def test_a_frame_without_background_is_fitted_and_sampled(tmp_path: Path) -> Non
     mean = float(level @ weight / weight.sum())
     sd = float(np.sqrt((level - mean) ** 2 @ weight / weight.sum()))
     assert abs(chain.draws()[:, 2].mean() - mean) < 4.0 * sd / np.sqrt(1000.0)
+
+
+def test_a_background_at_zero_gives_finite_numbers() -> None:
+    """Pixels between a source's reach and a segment's end have no expected counts then, and are in the likelihood."""
+    sources = SourceCatalog([-5.0, -5.0, 5.0, 5.0], [-5.5, 4.5, -5.5, 4.5], np.full(4, 5e3))
+    model = ForwardModel(Detector((24, 24)), sources, GaussianPSF(1.5), PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)]))
+    counts = simulate(model, [0.0, 0.0], 3.0, seed=1)
+    posterior = Posterior(model, counts, mask=counts < 1)
+    at = np.zeros(3)
+    assert np.isfinite(posterior.log_prob(at)) and np.all(posterior.expected_counts(at)[posterior.mask] >= 0.0)
+    assert np.all(np.isfinite(posterior.gradient(at))) and np.all(np.isfinite(posterior.information(at)))
+    assert np.all(np.isfinite(posterior.noise.residual(posterior.counts, posterior.expected_counts(at), 0.0)[posterior.mask]))
+    assert find_map(posterior).params[2] == 0.0

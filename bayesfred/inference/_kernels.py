@@ -826,6 +826,8 @@ def _weigh(counts, w, background, curve):
                 n = counts.values[p]
                 if n <= LIMIT:
                     w.score[p], w.weight[p], curve[p] = 0.0, 0.0, 0.0
+                elif counts.kind == POISSON and n == 0.0:  # whatever mu: it may be zero, too
+                    w.score[p], w.weight[p], curve[p] = -1.0, 0.0, 0.0
                 elif counts.kind == POISSON:
                     w.score[p], w.weight[p], curve[p] = n / mu - 1.0, n / (mu * mu), n / (mu * mu * mu)
                 else:
@@ -1021,7 +1023,7 @@ def _fisher_weight(counts, w, background):
                 u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
                 mu = w.image[p] + c0 + u * (c1 + u * c2)
                 counted = counts.values[p] > LIMIT
-                w.weight[p] = (1.0 / (mu if counts.kind == POISSON else c0)) if counted else 0.0
+                w.weight[p] = (1.0 / (max(mu, 1e-300) if counts.kind == POISSON else c0)) if counted else 0.0
             for k in range(j * per_row + start, j * per_row + stop):
                 pixels -= counts.segment_pixels[k]
             start, stop = _next_run(w.flags, w.span, per_row, j, stop)

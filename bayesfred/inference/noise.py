@@ -19,6 +19,8 @@ from bayesfred.inference import _kernels
 
 Floats = npt.NDArray[np.float64]
 
+NOTHING = 1e-300  # stands for an expected count of zero, at which nothing but zero can be counted
+
 
 class Noise(Protocol):
     """What a noise model offers; `background` and `mean` are counts per pixel."""
@@ -89,13 +91,13 @@ class PoissonNoise(Noise):
         return np.asarray(xlogy(n, mu) - mu - gammaln(np.maximum(n, 0.0) + 1.0))
 
     def score(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        return (counts + self.shift) / (mean + self.shift) - 1.0
+        return (counts + self.shift) / np.maximum(mean + self.shift, NOTHING) - 1.0
 
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
-        return 1.0 / (mean + self.shift)
+        return 1.0 / np.maximum(mean + self.shift, NOTHING)
 
     def residual(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        return (counts - mean) / np.sqrt(mean + self.shift)
+        return (counts - mean) / np.sqrt(np.maximum(mean + self.shift, NOTHING))
 
     def write(self, group: Any) -> None:
         group.attrs["kind"] = np.bytes_("poisson")
