@@ -503,6 +503,7 @@ def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> No
     assert np.all(np.isfinite(rows["log_likelihood.mean"]))
 
 
+@pytest.mark.statistics
 def test_right_error_bars_are_found_right_and_wrong_ones_wrong(tmp_path: Path) -> None:
     """The long run's verdict on few frames: of sources so bright that a determinant left out shows in every one."""
     right, wrong = (
