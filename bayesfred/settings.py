@@ -10,13 +10,13 @@ catalogues are read in `bayesfred.files`.
 from __future__ import annotations
 
 import difflib
+import errno
 import inspect
 import json
 import os
 import re
 import reprlib
 import tomllib
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -538,12 +538,14 @@ def within(folder: str | Path, path: str | Path, where: str) -> Path:
     bayesfred.errors.InputError: run.toml: output.path: got '../one.h5', which leads out of ..., expected a path that stays inside
     """
     place = Path(folder) / path
+    inside = False
     try:
         inside = place.resolve().is_relative_to(Path(folder).resolve())
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
-            os.stat(place)  # from Python 3.13 on `resolve` does not mind a loop of links
-    except (OSError, RuntimeError, ValueError):  # a loop of links, a name too long, a zero byte
-        inside = False
+        os.stat(place)
+    except OSError as error:  # from Python 3.13 on `resolve` does not mind a loop of links; other faults show when it is opened
+        inside = inside and error.errno != errno.ELOOP
+    except (RuntimeError, ValueError):  # a loop of links, a zero byte
+        pass
     if not inside:
         leads = f"{str(path)!r}, which leads out of {Path(folder).absolute()}"
         raise InputError(f"{where}: got {leads}, expected a path that stays inside")
