@@ -313,6 +313,16 @@ def test_a_psf_wider_than_the_frame_leaves_no_peaks() -> None:
     assert find_peaks(posterior).shape == (0, 2)
 
 
+def test_peaks_along_a_ridge_have_a_place() -> None:
+    """A bright row, as a faulty detector reads out: no column of it is higher than its neighbours."""
+    model = grid(side=3)
+    counts = np.ones(model.detector.shape)
+    counts[60] = 3e6
+    peaks = find_peaks(Posterior(model, counts))
+    assert len(peaks) > 9 and np.isfinite(peaks).all()
+    assert np.abs(peaks[:, 1] - 60.0 + 0.5 * (counts.shape[0] - 1)).max() < 1e-9
+
+
 def test_consistent_frames_are_called_so() -> None:
     """The deviance of true models is within 5 standard deviations of its expectation, at 0.05 counts a pixel too."""
     model = grid(side=5)

@@ -163,7 +163,9 @@ def find_peaks(posterior: Posterior) -> Floats:
     top = filtered[j, i]
 
     def vertex(before: Floats, after: Floats) -> Floats:
-        return np.asarray(0.5 * (before - after) / (before + after - 2.0 * top))
+        curvature = before + after - 2.0 * top
+        shift = np.zeros_like(top)  # along a ridge
+        return np.asarray(np.divide(0.5 * (before - after), curvature, out=shift, where=curvature < 0.0))
 
     i_peak = i + vertex(filtered[j, i - 1], filtered[j, i + 1])
     j_peak = j + vertex(filtered[j - 1, i], filtered[j + 1, i])
