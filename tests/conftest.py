@@ -17,4 +17,4 @@ package = Path(bayesfred.__file__).parent
 inlined = (package / "imaging" / "_kernels.py").stat().st_mtime
 for index in (package / "inference" / "__pycache__").glob("_kernels*.nbi"):
     if index.stat().st_mtime < inlined:
-        index.unlink()
+        index.unlink(missing_ok=True)

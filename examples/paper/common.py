@@ -79,7 +79,7 @@ def least_squares(model: bf.ForwardModel, frame: Floats, start: ArrayLike) -> tu
     def slopes(theta: Floats) -> Floats:
         return np.asarray((model.jacobian(theta) / flux).reshape(start.size, -1).T)
 
-    theta = optimize.least_squares(residual, start, slopes, method="lm", x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15).x
+    theta = optimize.least_squares(residual, start, slopes, method="lm", x_scale="jac", ftol=1e-9, xtol=1e-9, gtol=1e-9).x
     left = residual(theta)
     for _ in range(5):  # Gauss-Newton steps, as far as rounding lets them gain
         matrix = slopes(theta)
@@ -163,7 +163,7 @@ def measured(value: float, sd: float) -> str:
     '1.973 ± 0.021'
     """
     places = max(0, 1 - math.floor(math.log10(sd)))
-    return f"{value:.{places}f} ± {sd:.{places}f}"
+    return f"{round(value, places) + 0.0:.{places}f} ± {sd:.{places}f}"
 
 
 def listed(values: ArrayLike, places: int) -> str:
