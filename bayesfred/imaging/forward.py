@@ -4,7 +4,7 @@
 
 |D| makes each source's kernel integrate to one over the image, the constraint that Sun & Zhou state below
 their Eq. 1; their simulated kernel leaves it out, and so does `conserve_flux=False`. The sums over pixels are in
-`_kernels.py`; `inference/posterior.py` compares the result with counts.
+`kernels`; `inference/posterior.py` compares the result with counts.
 """
 
 import math
@@ -17,9 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesfred.errors import InputError
-from bayesfred.imaging import _kernels
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.kernels.images import image
+from bayesfred.imaging.kernels.jacobian import Basis, jacobian
+from bayesfred.imaging.kernels.maps import Optics, stride
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import FWHM, PSF, read_psf
 from bayesfred.imaging.scene import SourceCatalog
@@ -87,7 +89,7 @@ class ForwardModel:
                 "sub-pixel position; use pixel = 'box'"
             )
 
-    def optics(self, narrowest: float | None = None) -> _kernels.Optics:
+    def optics(self, narrowest: float | None = None) -> Optics:
         """The model as the compiled loops need it, with pixels integrated well for PSFs of widths down to `narrowest` (pixel)."""
         if isinstance(self.distortion, LogDistortion):
             raise InputError("distortion: got LogDistortion, expected PolynomialDistortion: what is not polynomial is not fitted")
@@ -98,7 +100,7 @@ class ForwardModel:
         ny, nx = self.detector.shape
         width, beta = self.psf.core
         offsets, weights = self.detector.quadrature(width if narrowest is None else width * narrowest / self.psf.sigma, beta)
-        return _kernels.Optics(
+        return Optics(
             psf=self.psf.profile,
             x=self.sources.x,
             y=self.sources.y,
@@ -112,17 +114,17 @@ class ForwardModel:
             ny=ny,
             nx=nx,
             reach=self.psf.reach(self.tolerance) / self.psf.sigma,
-            ramp=self.detector.binning * np.arange(_kernels.stride(nx), dtype=np.float64),
+            ramp=self.detector.binning * np.arange(stride(nx), dtype=np.float64),
             degree=(0,) * degree,
             q_degree=(0,) * (2 * degree),
             d_degree=(0,) * (2 * degree - 1) if self.conserve_flux else (),
         )
 
     @cached_property
-    def _optics(self) -> _kernels.Optics:
+    def _optics(self) -> Optics:
         return self.optics()
 
-    def basis(self, nuisances: Sequence[str] = ()) -> _kernels.Basis:
+    def basis(self, nuisances: Sequence[str] = ()) -> Basis:
         """What the derivatives are made of: those with respect to theta, then to the named nuisances."""
         d, ones = self.distortion, np.ones((len(self.sources), 1))
         constant = [(0, 0)] if "offset_x" in nuisances else []
@@ -138,7 +140,7 @@ class ForwardModel:
             else:
                 index.append(len(f) + len(g) + ("flux_scale", "psf_sigma").index(name))
             levers.append(-ones if name.startswith("offset") else ones)
-        return _kernels.Basis(
+        return Basis(
             f=np.array(f, dtype=np.int64).reshape(-1, 2),
             g=np.array(g, dtype=np.int64).reshape(-1, 2),
             row=np.array(index, dtype=np.int64),
@@ -166,8 +168,8 @@ class ForwardModel:
         ny, nx = self.detector.shape
         if isinstance(self.distortion, LogDistortion):
             return self._every_pixel() + background
-        out = np.full(ny * _kernels.stride(nx), float(background))
-        _kernels.image(self._optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
+        out = np.full(ny * stride(nx), float(background))
+        image(self._optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
         return out.reshape(ny, -1)[:, :nx]
 
     def _every_pixel(self) -> Floats:
@@ -199,8 +201,8 @@ class ForwardModel:
         ndarray, shape (n_terms, ny, nx), counts per pixel per unit of the coefficient
         """
         ny, nx = self.detector.shape
-        out = np.zeros((self.distortion.n_terms, ny, _kernels.stride(nx)))
-        _kernels.jacobian(self._optics, self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out)
+        out = np.zeros((self.distortion.n_terms, ny, stride(nx)))
+        jacobian(self._optics, self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out)
         return out[:, :, :nx]
 
     def _check(self, theta: npt.ArrayLike) -> Floats:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy import linalg, ndimage, special
 
 from bayesfred.errors import InputError
-from bayesfred.imaging import _kernels
+from bayesfred.imaging.kernels.profiles import Gaussian, Moffat, Spline
 
 Floats = npt.NDArray[np.float64]
 
@@ -71,9 +71,9 @@ class GaussianPSF:
         return self.sigma, math.inf
 
     @property
-    def profile(self) -> _kernels.Gaussian:
+    def profile(self) -> Gaussian:
         """The PSF of unit width as the compiled loops need it."""
-        return _kernels.Gaussian(1.0 / (2.0 * math.pi))
+        return Gaussian(1.0 / (2.0 * math.pi))
 
     def reach(self, tolerance: float) -> float:
         """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel."""
@@ -158,10 +158,10 @@ class MoffatPSF:
         return self.alpha / math.sqrt(2.0 * self.beta), self.beta
 
     @property
-    def profile(self) -> _kernels.Moffat:
+    def profile(self) -> Moffat:
         """The PSF of unit width as the compiled loops need it."""
         square = (self.alpha / self.sigma) ** 2
-        return _kernels.Moffat((self.beta - 1.0) / (math.pi * square), square, self.beta)
+        return Moffat((self.beta - 1.0) / (math.pi * square), square, self.beta)
 
     def reach(self, tolerance: float) -> float:
         """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel."""
@@ -342,10 +342,10 @@ class SampledPSF:
         return self.sigma, 3.0
 
     @property
-    def profile(self) -> _kernels.Spline:
+    def profile(self) -> Spline:
         """The PSF of unit width as the compiled loops need it."""
         pitch = 1.0 / (self.oversampling * self.sigma)
-        return _kernels.Spline(1.0 / pitch**2, self._spline, pitch)
+        return Spline(1.0 / pitch**2, self._spline, pitch)
 
     def reach(self, tolerance: float) -> float:
         """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel.

@@ -2,7 +2,7 @@
 
 Each class draws frames and gives, pixel by pixel, the log-likelihood, its derivative with respect to the mean (the
 score), the expected information (the Fisher weight) and the standardised residual. These are the definitions; the
-compiled loops in `_kernels.py` evaluate the same formulas over whole frames.
+compiled loops in `kernels` evaluate the same formulas over whole frames.
 """
 
 import math
@@ -15,7 +15,7 @@ from scipy.special import gammaln, xlogy
 
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.inference import _kernels
+from bayesfred.inference.kernels.likelihood import GAUSSIAN, POISSON
 
 Floats = npt.NDArray[np.float64]
 
@@ -71,7 +71,7 @@ class PoissonNoise(Noise):
     """
 
     read_noise: float = 0.0
-    kind: ClassVar[int] = _kernels.POISSON
+    kind: ClassVar[int] = POISSON
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.read_noise) and self.read_noise >= 0):
@@ -121,7 +121,7 @@ class BackgroundNoise(Noise):
     array([0.2])
     """
 
-    kind: ClassVar[int] = _kernels.GAUSSIAN
+    kind: ClassVar[int] = GAUSSIAN
     read_noise: ClassVar[float] = 0.0
     shift: ClassVar[float] = 0.0
 

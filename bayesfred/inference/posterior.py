@@ -1,7 +1,7 @@
 """The posterior of a field distortion: prior times likelihood of a frame, as functions of a parameter vector.
 
 Parameters are the distortion coefficients, the background and whatever `Nuisances` leaves free. The likelihood and its
-derivatives are in `_kernels.py`; `estimate.py` finds the maximum, `sampling.py` draws.
+derivatives are in `kernels`; `estimate.py` finds the maximum, `sampling.py` draws.
 """
 
 import os
@@ -19,9 +19,15 @@ import numpy.typing as npt
 from scipy.special import gammaln
 
 from bayesfred.errors import InputError
-from bayesfred.imaging._kernels import SEGMENT, Basis, Optics, image, stride
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.inference import _kernels, priors
+from bayesfred.imaging.kernels.images import image
+from bayesfred.imaging.kernels.jacobian import Basis
+from bayesfred.imaging.kernels.maps import SEGMENT, Optics, stride
+from bayesfred.inference import priors
+from bayesfred.inference.kernels.fisher import fisher
+from bayesfred.inference.kernels.fluxes import Drawn, draw, log_likelihoods
+from bayesfred.inference.kernels.gradient import gradient
+from bayesfred.inference.kernels.likelihood import LIMIT, MASKED, Counts, Workspace, clear, new_workspace
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, read_noise_model
 
 Floats = npt.NDArray[np.float64]
@@ -332,7 +338,7 @@ class Posterior:
 
         def evaluate(first: int) -> None:
             with self._workspace() as w:
-                _kernels.log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out)
+                log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out)
 
         if threads == 1:
             evaluate(0)
@@ -360,9 +366,7 @@ class Posterior:
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
         with self._drawn(arguments) as (w, drawn):
-            slope = _kernels.gradient(
-                self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background
-            )
+            slope = gradient(self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background)
         if np.isnan(slope):
             return np.full(vector.size, np.nan)
         if isinstance(self.noise, BackgroundNoise):
@@ -393,7 +397,7 @@ class Posterior:
         size = self._basis.row.size + terms
         out = np.zeros((size, size))
         with self._drawn(arguments) as (w, drawn):
-            known = _kernels.fisher(self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free, self._basis, out)
+            known = fisher(self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free, self._basis, out)
         if np.isnan(known):
             return np.full((vector.size, vector.size), np.nan)
         if self.nuisances.position_scatter:  # independent of the others: it is known by the shifts' size alone
@@ -503,25 +507,25 @@ class Posterior:
         return np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]), nuisances, background
 
     @contextmanager
-    def _workspace(self) -> Iterator[_kernels.Workspace]:
+    def _workspace(self) -> Iterator[Workspace]:
         """A workspace that no other thread uses meanwhile."""
         try:
             workspace = self._workspaces.get_nowait()
         except queue.Empty:
             typical = self._arguments(self.start()[None])[1][0]
-            workspace = _kernels.new_workspace(self._optics, typical, self._free)
+            workspace = new_workspace(self._optics, typical, self._free)
         yield workspace
         self._workspaces.put(workspace)
 
     @contextmanager
-    def _drawn(self, arguments: list[Floats]) -> Iterator[tuple[_kernels.Workspace, _kernels.Drawn]]:
+    def _drawn(self, arguments: list[Floats]) -> Iterator[tuple[Workspace, Drawn]]:
         """A workspace in which the sources are drawn, for one set of arguments."""
         with self._workspace() as w:
-            yield w, _kernels.draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
-            _kernels.clear(w)
+            yield w, draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
+            clear(w)
 
     @cached_property
-    def _workspaces(self) -> "queue.SimpleQueue[_kernels.Workspace]":
+    def _workspaces(self) -> "queue.SimpleQueue[Workspace]":
         return queue.SimpleQueue()
 
     @cached_property
@@ -552,14 +556,14 @@ class Posterior:
         return self.nuisances.flux == "free"
 
     @cached_property
-    def _frame(self) -> _kernels.Counts:
+    def _frame(self) -> Counts:
         ny, nx = self.model.detector.shape
-        values = np.full((ny, stride(nx)), _kernels.MASKED)
-        values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, _kernels.MASKED)
-        used = (values > _kernels.LIMIT).reshape(-1, SEGMENT)
+        values = np.full((ny, stride(nx)), MASKED)
+        values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, MASKED)
+        used = (values > LIMIT).reshape(-1, SEGMENT)
         clean = np.where(used, values.reshape(-1, SEGMENT), 0.0)
         total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
-        return _kernels.Counts(
+        return Counts(
             values.ravel(), used.sum(axis=1).astype(float), total, squares,
             float(used.sum()), float(total.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
         )  # fmt: skip

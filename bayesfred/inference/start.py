@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, ndimage, spatial
 
-from bayesfred.imaging._kernels import image_positions
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.kernels.maps import image_positions
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.ascent import climb

@@ -1,0 +1,1 @@
+"""Compiled loops of the forward model: arrays in, arrays out, no validation."""

@@ -1,0 +1,1 @@
+"""Compiled loops over counts: log-likelihood, its exact gradient, Fisher information, profiled fluxes."""
