@@ -207,7 +207,7 @@ def read_catalogue(
     ------
     InputError
         The file is missing, damaged or empty; a column is absent; a value is no finite number; a flux is not
-        positive; two rows have the same position. Rows are numbered from 1, the heading not counted.
+        positive, or more than 9e15; two rows have the same position. Rows are numbered from 1, the heading not counted.
 
     Examples
     --------
@@ -236,11 +236,11 @@ def read_catalogue(
         with np.errstate(over="ignore", under="ignore"):
             columns[2] = 10.0 ** (-0.4 * (columns[2] - zero_point))
     record = CatalogueRecord(*columns)
-    bad = np.flatnonzero(~(np.isfinite(record.flux) & (record.flux > 0)))
+    bad = np.flatnonzero(~((record.flux > 0) & (record.flux <= _MOST_COUNTS)))
     if bad.size:
         where = f"row {bad[0] + 1}, column {magnitude or flux!r}"
         got = f"a flux of {record.flux[bad[0]]:.9g}"
-        raise InputError(f"{path}: {where}: got {got}, expected a positive, finite one")
+        raise InputError(f"{path}: {where}: got {got}, expected a positive one of at most {_MOST_COUNTS:.0e} counts")
     _require_distinct(path, record)
     return record
 

@@ -478,6 +478,9 @@ REFUSALS = [
     Refusal("array for a table", content("run.toml", "frame = [1]"), ("run.toml", "frame", "[1]", "table")),
     Refusal("duplicate sources", content("stars.csv", "x,y,flux\n1,2,9\n3,4,9\n1,2,8\n"), ("stars.csv", "row 3", "in row 1")),
     Refusal("negative flux", content("stars.csv", "x,y,flux\n1,2,-9\n"), ("stars.csv", "row 1", "'flux'", "-9", "positive")),
+    Refusal(
+        "absurd flux", content("stars.csv", "x,y,flux\n1,2,1e200\n"), ("stars.csv", "row 1", "'flux'", "1e+200", "at most 9e+15")
+    ),
     Refusal("nan position", content("stars.csv", "x,y,flux\nnan,2,9\n"), ("stars.csv", "row 1", "'x'", "nan", "finite")),
     Refusal("missing catalogue", without("stars.csv"), ("run.toml", "stars.csv", "BAYESFRED_DATA")),
     Refusal("missing column", content("stars.csv", "x,y,light\n0,0,1\n"), ("stars.csv", "'flux'", "'light'")),
