@@ -13,8 +13,8 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference import ascent, start
-from bayesfred.inference.ascent import climb
+from bayesfred.inference import ascent, estimate, start
+from bayesfred.inference.ascent import Ascent, climb
 from bayesfred.inference.estimate import find_map
 from bayesfred.inference.noise import BackgroundNoise, simulate
 from bayesfred.inference.posterior import Nuisances, Posterior
@@ -209,6 +209,18 @@ def test_no_start_folds(monkeypatch: pytest.MonkeyPatch) -> None:
     # without the way back there would be nowhere to climb from
     monkeypatch.setattr(start, "_unfolded", lambda posterior, params, plain: params)
     assert start.find_start(posterior).path == "the prior's medians"
+
+
+def test_a_climb_that_ends_at_no_maximum_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = grid(side=5, distortion=MIRRORED)
+    posterior = Posterior(model, simulate(model, np.zeros(12), 2.0, seed=7))
+    begun = start.find_start(posterior)
+    lost = Ascent(begun.params, float(posterior.log_prob(begun.params)), np.full((13, 13), np.nan), np.inf, 9)
+    monkeypatch.setattr(estimate, "climb", lambda p, begin: lost if np.array_equal(begin, begun.params) else climb(p, begin))
+    found = find_map(posterior)
+    assert found.converged and "the prior's medians" in found.message
+    monkeypatch.setattr(estimate, "other_starts", lambda posterior, tried: iter(()))
+    assert not find_map(posterior).at_maximum
 
 
 @pytest.mark.parametrize("conserve_flux", [True, False])

@@ -13,7 +13,7 @@ from bayesfred.inference import priors
 from bayesfred.inference.ascent import climb
 from bayesfred.inference.goodness import goodness
 from bayesfred.inference.posterior import Posterior
-from bayesfred.inference.start import find_start
+from bayesfred.inference.start import Start, find_start, other_starts
 
 Floats = npt.NDArray[np.float64]
 
@@ -152,7 +152,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     if start is None:
         begun = find_start(posterior)
         origin = begun.params
-        how = f" from {begun.path}, {begun.matched} of {len(posterior.model.sources)} sources matched"
+        how = _how(posterior, begun)
     else:
         origin, how = np.array(start, dtype=np.float64), ""
     if not np.isfinite(posterior.log_prob(origin)):
@@ -164,6 +164,11 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
             "noise: leave out terms, add sources, or give these parameters a narrower prior"
         )
     top = climb(posterior, origin)
+    if start is None and top.distance >= CLOSENESS:
+        for other in other_starts(posterior, begun):
+            if np.isfinite(posterior.log_prob(other.params)) and (again := climb(posterior, other.params)).distance < CLOSENESS:
+                top, how = again, _how(posterior, other)
+                break
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
     message = f"gradient {top.distance:.1g} standard deviations from zero after {top.evaluations} evaluations{how}"
@@ -178,6 +183,10 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
         message = f"found, {message}; residuals as the noise makes them"
     converged = at_maximum and abs(excess) <= CONSISTENT
     return MapEstimate(top.params, top.covariance, top.log_prob, converged, top.evaluations, message, at_maximum)
+
+
+def _how(posterior: Posterior, begun: Start) -> str:
+    return f" from {begun.path}, {begun.matched} of {len(posterior.model.sources)} sources matched"
 
 
 def _excess(posterior: Posterior, params: Floats) -> float:

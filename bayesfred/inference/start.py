@@ -14,6 +14,7 @@ the axis that grows as far as the last climb foretells stars within the PSF's wi
 where even the innermost are foretold less surely.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -44,6 +45,7 @@ LOST_AT_MOST = 0.45  # ... nor a climb from it
 REACH = 0.7  # the likelihood finds a star that is predicted to so many PSF widths
 FEWEST = 6  # stars of the innermost disk
 STEPS = 8  # of a climb on the way
+PLAIN, DISK = "the prior's medians", "a growing disk"
 
 
 class Start(NamedTuple):
@@ -95,16 +97,13 @@ def find_start(posterior: Posterior) -> Start:
         if trusted:
             break
     trusted, matched, z = max(matches, key=lambda each: each[:2])
-    field = Field(posterior)
-    plain = posterior.start()
-    plain[field.columns] = field.centre
-    plain = np.clip(plain, *posterior.support)
+    field, plain = Field(posterior), _plain(posterior)
     params = plain.copy()
     params[field.columns] = z
     params = np.clip(params, *posterior.support)
     params = _unfolded(posterior, params, plain)
     if not np.isfinite(posterior.log_prob(params)):
-        return Start(plain, "the prior's medians", matched)
+        return Start(plain, PLAIN, matched)
     if trusted:
         return Start(params, "matched peaks", matched)
     first = climb(posterior, params, steps=STEPS)
@@ -113,8 +112,36 @@ def find_start(posterior: Posterior) -> Start:
     grown = _unfolded(posterior, outward(field, plain), plain)
     second = climb(posterior, grown, steps=STEPS)
     if second.log_prob > first.log_prob:
-        return Start(second.params, "a growing disk", matched)
+        return Start(second.params, DISK, matched)
     return Start(first.params, "matched peaks and a first climb", matched)
+
+
+def other_starts(posterior: Posterior, tried: Start) -> Iterator[Start]:
+    """Where to begin anew after a start from which no maximum was found, as at the edge of folding.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    tried : Start
+        From `find_start`.
+
+    Yields
+    ------
+    Start
+        With no source matched.
+    """
+    plain = _plain(posterior)
+    if tried.path != PLAIN:
+        yield Start(plain, PLAIN, 0)
+    if tried.path != DISK:
+        yield Start(_unfolded(posterior, outward(Field(posterior), plain), plain), DISK, 0)
+
+
+def _plain(posterior: Posterior) -> Floats:
+    """No distortion, or the least that the priors admit."""
+    field, plain = Field(posterior), posterior.start()
+    plain[field.columns] = field.centre
+    return np.clip(plain, *posterior.support)
 
 
 def _unfolded(posterior: Posterior, params: Floats, plain: Floats) -> Floats:
