@@ -541,5 +541,5 @@ def test_the_posterior_is_rebuilt(
 def test_walkers_that_hardly_move_leave_half_the_run_out(monkeypatch: pytest.MonkeyPatch, effective: float) -> None:
     """However long the correlation is; 1/effective overflows no logarithm."""
     sizes = np.full(2, effective)
-    monkeypatch.setattr(sampling, "convergence", lambda _: (sizes, sizes, sizes))
+    monkeypatch.setattr(sampling, "effective_sizes", lambda _: (sizes, sizes))
     assert burn_in(np.random.default_rng(1).standard_normal((4, 80, 8, 2))) == 40

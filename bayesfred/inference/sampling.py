@@ -28,7 +28,7 @@ from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.inference.chainfile import Chain, check_same_posterior, open_chain, random_states, write_chain
-from bayesfred.inference.convergence import convergence
+from bayesfred.inference.convergence import convergence, effective_sizes
 from bayesfred.inference.ensembles import Step, adapted, advance, begin, check_start
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.lock import only_writer
@@ -148,8 +148,7 @@ def burn_in(chain: Floats) -> int:
     made: int = min(adapted(chain), chain.shape[1] - 1)
     n_steps: int = chain.shape[1] - made
     kept = chain[:, made + n_steps // 4 :]
-    _, bulk, tail = convergence(kept)
-    effective = float(min(bulk.min(), tail.min()))
+    effective = float(np.min(effective_sizes(kept)))
     draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
     half = n_steps // 2
     if not effective * half > draws:  # tau is longer
@@ -201,7 +200,7 @@ class _Run:
         """Go on until the target is met, or to the given number of steps."""
         check = FIRST_CHECK
         while steps is None and check < len(self.steps):  # the checks fall on the same steps in a resumed run
-            check = math.ceil(check * GROWTH)
+            check = max(check + 1, int(check * GROWTH))
         due = time.monotonic() + CHECKPOINT
         state = TextColumn("{task.fields[state]}")
         columns = (TextColumn("sampling"), BarColumn(), state, TimeElapsedColumn(), TimeRemainingColumn())
@@ -217,7 +216,7 @@ class _Run:
                         if enough:
                             break
                         bar.update(task, total=max(n + 1, math.ceil(n / max(share, 0.05))))
-                        check = math.ceil(check * GROWTH)
+                        check = max(check + 1, int(check * GROWTH))
                     if time.monotonic() >= due:
                         began = time.monotonic()
                         self._save(self._unfinished(target_ess))
@@ -245,9 +244,9 @@ class _Run:
         draws = chain[..., 0].size
         if draws < target_ess:  # effective draws are not more than draws
             return False, draws / target_ess
-        rhat, bulk, tail = convergence(chain[:, burn_in(chain) :])
-        share = float(min(bulk.min(), tail.min()) / target_ess)
-        return bool(share >= 1.0 and rhat.max() <= RHAT), share
+        kept = chain[:, burn_in(chain) :]
+        share = float(np.min(effective_sizes(kept)) / target_ess)
+        return bool(share >= 1.0 and convergence(kept)[0].max() <= RHAT), share
 
     def _unfinished(self, target_ess: float) -> Chain:
         """The run so far, with the most burn-in there can be, because finding the right one takes longer than to save it."""

@@ -17,10 +17,10 @@ MODULES = ("frames", "sampling", "figure5", "figure6", "table2", "table3")
 HEAD = """# The paper's tables and figures
 
 Made by `python -m examples.paper`; do not edit. The paper is Y. Sun & J. Zhou, *Field Distortion Model Based on Fredholm Integral*.
-Every number that it prints stands beside ours; a number with ± is a posterior mode and its standard deviation, or says what its
-error is. Two numbers agree if they differ by less than three standard errors of their difference, both measurements having the
-same error (the frames have different noise); without noise, as each row says. "about" is rounding error, of which the size alone
-means something.
+Every number that it prints stands beside ours; a number with ± is a posterior mode and its standard deviation, or its section
+says what the error is. Two numbers agree if they differ by less than three standard errors of their difference, both
+measurements having the same error (the frames have different noise); without noise, as each row or section says. "about" is
+rounding error, of which the size alone means something.
 """
 
 
