@@ -552,8 +552,8 @@ class Posterior:
         return self.model.sources.flux
 
     @property
-    def _free(self) -> bool:
-        return self.nuisances.flux == "free"
+    def _free(self) -> Literal[True] | None:
+        return True if self.nuisances.flux == "free" else None  # what None leaves out is not compiled
 
     @cached_property
     def _frame(self) -> Counts:

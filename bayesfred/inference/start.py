@@ -117,19 +117,7 @@ def find_start(posterior: Posterior) -> Start:
 
 
 def other_starts(posterior: Posterior, tried: Start) -> Iterator[Start]:
-    """Where to begin anew after a start from which no maximum was found, as at the edge of folding.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    tried : Start
-        From `find_start`.
-
-    Yields
-    ------
-    Start
-        With no source matched.
-    """
+    """Where to begin anew after a start from which no maximum was found, as at the edge of folding."""
     plain = _plain(posterior)
     if tried.path != PLAIN:
         yield Start(plain, PLAIN, 0)

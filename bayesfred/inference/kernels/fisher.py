@@ -80,7 +80,7 @@ def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
                     for m in range(k + 1):
                         out[k, m] += dot(left, band[m, j - top, a:b], weight)
                 start, stop = next_run(w.flags, w.span, per_row, j, stop)
-        if free:
+        if free is not None:
             for s in range(fitted.size):
                 for j in range(max(top, boxes[s, 0]), min(last, boxes[s, 1])):
                     i = fp.first[s] + j - boxes[s, 0]
@@ -92,7 +92,7 @@ def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
                             cross[s * templates + t, k] += dot(band[k, j - top, a:b], stamp, weight)
     out[sources, sources] += pixels / background[0] if pixels > 0.0 else 0.0
     known = 0.0
-    if free:
+    if free is not None:
         at = row_starts(fp, pitch)
         for c in range(clusters.first.size - 1):
             members, lead, start = one_cluster(clusters, c, templates)

@@ -275,7 +275,8 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
 def draw(o, counts, w, theta, nuisances, background, flux, free):
     """Draw all sources, profiling their fluxes if they are free; whoever uses the image clears the workspace.
 
-    Nuisances are flux_scale, offset_x, offset_y, psf_sigma, position_scatter.
+    Nuisances are flux_scale, offset_x, offset_y, psf_sigma, position_scatter. Here and wherever else it is passed, `free` is True,
+    or None where fluxes are fixed: a type of its own, for which what profiles them is not compiled.
     """
     maps = new_maps(o)
     sigma, scatter = nuisances[3], nuisances[4]
@@ -288,17 +289,19 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
     if counts.varies:
         mark_counted(counts, w)
     templates = 3 if scatter > 0.0 else 1
-    boxes = bounding_boxes(fp) if free else np.empty((0, 4), np.int64)
-    clusters = find_clusters(boxes, o.ny, templates)
-    factors = np.empty(clusters.begin[-1])
     fluxes, shifts = np.empty(flux.size), np.zeros((flux.size, 2))
-    if free:
+    if free is not None:
+        boxes = bounding_boxes(fp)
+        clusters = find_clusters(boxes, o.ny, templates)
+        factors = np.empty(clusters.begin[-1])
         stamps = _room(w, 3 * w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
         extra += _profile(
             o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, 0.5 * flux, fluxes, shifts, factors
         )
     else:
-        stamps = np.empty((1, 0))
+        none = np.empty(0, np.int64)
+        boxes, clusters = np.empty((0, 4), np.int64), Clusters(none, none, none, none, none)
+        factors, stamps = np.empty(0), np.empty((1, 0))
         work = new_work(o)
         at = row_starts(fp, w.image.size // o.ny)
         for s in range(o.x.size):

@@ -229,7 +229,7 @@ def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_b
     _weigh(counts, w, background, curve)
     image = w.score
     z, mixed, slope = np.zeros((fluxes.size, size)), np.empty((size, 0)), 0.0
-    if free:
+    if free is not None:
         z, mixed, image, slope = _laplace_adjoint(o, w, drawn, sigma, nuisances[4], curve)
     _background_gradient(counts, w, background, image, out_background)
     pitch = w.image.size // o.ny
@@ -244,7 +244,7 @@ def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_b
             for t in range(size):
                 for k in range(n):
                     c[k] = fluxes[s] * image[at + k] if t == 0 else 0.0
-                if free:
+                if free is not None:
                     q, amplitude = fp.start[p], 1.0 if t == 0 else fluxes[s]
                     for k in range(n):
                         c[k] += amplitude * (z[s, t] * w.score[at + k] - w.weight[at + k] * mixed[t, q + k])

@@ -62,7 +62,7 @@ def new_workspace(o, nuisances, free):
     span[:, 0] = pitch
     span[:, 1] = -1
     size, room = ny * pitch, 0
-    if free:
+    if free is not None:
         maps = new_maps(o)
         locate(o, np.zeros(o.f_powers.shape[0] + o.g_powers.shape[0]), 0.0, 0.0, nuisances[3], 6.0 * nuisances[4], maps)
         fp = footprints(o, maps)
