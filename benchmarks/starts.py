@@ -230,7 +230,7 @@ def logarithm() -> Table:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--problems", type=int, default=500)
-    parser.add_argument("--rivals", type=int, default=40, help="scipy's optimisers try this many of the problems")
+    parser.add_argument("--rivals", type=int, default=60, help="scipy's optimisers try this many of the problems")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--output", type=Path, default=Path("starts.jsonl"), help="results, one line a problem")
     options = parser.parse_args()

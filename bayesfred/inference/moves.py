@@ -171,7 +171,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
                 normal += truncnorm.logpdf(z[:, i], *self._interval(i, mean, lower, z)) - norm.logpdf(z[:, i])
             student = np.log(HEAVY_SHARE) + peak - 0.5 * (nu + d) * np.log1p(squared / nu)
             parts.append(np.logaddexp(normal, student) + np.log(weight) - np.log(np.diag(lower)).sum())
-        return np.asarray(logsumexp(parts, axis=0))
+        return np.asarray(np.logaddexp.reduce(parts, axis=0))
 
     def get_proposal(self, s: Floats, c: Sequence[Floats], random: np.random.RandomState) -> tuple[Floats, Floats]:
         """New positions for the walkers at s, and log q(s) - log q(new); the other walkers c are not used."""

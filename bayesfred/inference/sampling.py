@@ -241,10 +241,10 @@ class _Run:
     def _enough(self, target_ess: float) -> tuple[bool, float]:
         """Whether the draws so far suffice, and which share of the effective draws wanted they are."""
         chain = np.stack([step.coords for step in self.steps], axis=1)
-        draws = chain[..., 0].size
+        kept = chain[:, burn_in(chain) :]
+        draws = kept[..., 0].size
         if draws < target_ess:  # effective draws are not more than draws
             return False, draws / target_ess
-        kept = chain[:, burn_in(chain) :]
         share = float(np.min(effective_sizes(kept)) / target_ess)
         return bool(share >= 1.0 and convergence(kept)[0].max() <= RHAT), share
 
