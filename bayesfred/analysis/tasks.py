@@ -255,12 +255,12 @@ def cluster(address: str) -> Iterator[Executor]:
     except ImportError:
         raise InputError("--scheduler: distributed is not installed, expected it: pip install 'bayesfred[dask]'") from None
     try:
-        client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=10)
     except (OSError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"--scheduler: got {address!r} ({reason}), expected a Dask scheduler's address: tcp://host:port") from None
     with client:
-        yield client.get_executor()  # type: ignore[no-untyped-call]
+        yield client.get_executor()
 
 
 @contextmanager
