@@ -219,6 +219,7 @@ def test_a_climb_that_ends_at_no_maximum_begins_anew(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(estimate, "climb", lambda p, begin: lost if np.array_equal(begin, begun.params) else climb(p, begin))
     found = find_map(posterior)
     assert found.converged and "the prior's medians" in found.message
+    assert found.n_evaluations > lost.evaluations
     monkeypatch.setattr(estimate, "other_starts", lambda posterior, tried: iter(()))
     assert not find_map(posterior).at_maximum
 

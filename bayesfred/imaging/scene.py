@@ -26,13 +26,13 @@ class SourceCatalog:
     x, y : ndarray, shape (n_sources,), pixel
         Positions in the object plane from the middle of the frame. They may lie outside the frame.
     flux : ndarray, shape (n_sources,), photons
-        Expected photons of each source over the whole plane, > 0.
+        Expected photons of each source over the whole plane, > 0 and at most 2**53: float64 counts no further.
 
     Raises
     ------
     InputError
         If an array is not one-dimensional, is empty or not finite, if their lengths differ, or if a flux is
-        not > 0.
+        not > 0 or more than 2**53.
 
     Examples
     --------
@@ -51,9 +51,12 @@ class SourceCatalog:
             raise InputError(
                 f"x, y, flux: got {len(self.x)}, {len(self.y)} and {len(self.flux)} values, expected one of each for every source"
             )
-        if not (self.flux > 0.0).all():
-            first = int(np.argmin(self.flux > 0.0))
-            raise InputError(f"flux: got {self.flux[first]:g} for source {first}, expected > 0: remove it or mend it")
+        good = (self.flux > 0.0) & (self.flux <= 2.0**53)
+        if not good.all():
+            first = int(np.argmin(good))
+            raise InputError(
+                f"flux: got {self.flux[first]:g} for source {first}, expected > 0 and at most 9e15: remove it or mend it"
+            )
 
     @classmethod
     def grid(cls, side: int, spacing: float, flux: float) -> Self:

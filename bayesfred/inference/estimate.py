@@ -124,7 +124,8 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     ----------
     posterior : Posterior
     start : array_like, shape (d,), optional
-        Where to begin; by default what the counts alone say: peaks matched to the catalogue, see `start.py`.
+        Where to begin; by default what the counts alone say: peaks matched to the catalogue, and other starts where no
+        maximum is found from there, see `start.py`.
 
     Returns
     -------
@@ -164,14 +165,19 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
             "noise: leave out terms, add sources, or give these parameters a narrower prior"
         )
     top = climb(posterior, origin)
+    evaluations = top.evaluations
     if start is None and top.distance >= CLOSENESS:
         for other in other_starts(posterior, begun):
-            if np.isfinite(posterior.log_prob(other.params)) and (again := climb(posterior, other.params)).distance < CLOSENESS:
+            if not np.isfinite(posterior.log_prob(other.params)):
+                continue
+            again = climb(posterior, other.params)
+            evaluations += again.evaluations
+            if again.distance < CLOSENESS:
                 top, how = again, _how(posterior, other)
                 break
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
-    message = f"gradient {top.distance:.1g} standard deviations from zero after {top.evaluations} evaluations{how}"
+    message = f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} evaluations{how}"
     bounds = zip(posterior.parameter_names, top.params, *posterior.support, strict=True)
     if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
         message += f", {', '.join(at_bound)} at a bound of the prior"
@@ -182,7 +188,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     else:
         message = f"found, {message}; residuals as the noise makes them"
     converged = at_maximum and abs(excess) <= CONSISTENT
-    return MapEstimate(top.params, top.covariance, top.log_prob, converged, top.evaluations, message, at_maximum)
+    return MapEstimate(top.params, top.covariance, top.log_prob, converged, evaluations, message, at_maximum)
 
 
 def _how(posterior: Posterior, begun: Start) -> str:
