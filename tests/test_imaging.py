@@ -563,7 +563,7 @@ def test_catalogue_copies_its_columns_and_keeps_them() -> None:
         (([1.0], [np.nan], [1.0]), "y: got nan for source 0"),
         (([1.0, 1.0], [1.0, 1.0], [1.0, np.inf]), "flux: got inf for source 1"),
         (([1.0, 1.0], [1.0, 1.0], [1.0, 0.0]), "flux: got 0 for source 1, expected > 0"),
-        (([1.0, 1.0], [1.0, 1.0], [1.0, 1e200]), "flux: got 1e+200 for source 1, expected > 0 and at most 9e15"),
+        (([1.0, 1.0], [1.0, 1.0], [1.0, 1e200]), "flux: got 1e.200 for source 1, expected > 0 and at most 9e15"),
         (([1.0], ["east"], [1.0]), "y: .*not numbers"),
     ],
 )
