@@ -19,6 +19,7 @@ from bayesfred.inference.posterior import Posterior
 Floats = npt.NDArray[np.float64]
 
 CLOSE_ENOUGH = 3e-4  # standard deviations from the maximum, where log_prob differs from it by 5e-8; sums over frames round at 1e-9
+NEAR = 0.1  # ... where only so many steps are asked for
 MOST_EVALUATIONS = 300  # after which no more searches begin
 AS_FORETOLD = 0.5  # a Newton step whose gain is what it foretells to within this part is followed by another
 
@@ -71,7 +72,7 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
             shares = optimize.lsq_linear(lower.T, slope, bounds, method="bvls").x
             step, length = scale * shares, lower.T @ shares
         distance, foretold = float(np.linalg.norm(length)), float(slope @ length - 0.5 * length @ length)
-        if distance < CLOSE_ENOUGH or evaluations >= MOST_EVALUATIONS or taken == steps:
+        if distance < (CLOSE_ENOUGH if steps is None else NEAR) or evaluations >= MOST_EVALUATIONS or taken == steps:
             break
         gain, taken = -np.inf, taken + 1
         for fraction in 0.5 ** np.arange(10):

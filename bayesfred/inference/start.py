@@ -11,7 +11,8 @@ it may be. The prior keeps the fit from running away; weights that fall with the
 
 Where stars overlap or are too faint to be matched one by one, the likelihood does the same: it is climbed on a disk around
 the axis that grows as far as the last climb foretells stars within the PSF's width, and with a wider PSF, on a blurred frame,
-where even the innermost are foretold less surely.
+where even the innermost are foretold less surely. From every disk only the places of its stars are taken over, under the prior.
+Climbs on the way leave out what the catalogue does not explain, see `unexplained.py`.
 """
 
 from collections.abc import Iterator
@@ -28,6 +29,7 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.ascent import climb
 from bayesfred.inference.posterior import Posterior
+from bayesfred.inference.unexplained import explained, settled
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -100,20 +102,20 @@ def find_start(posterior: Posterior) -> Start:
     field, plain = Field(posterior), _plain(posterior)
     params = plain.copy()
     params[field.columns] = z
-    params = np.clip(params, *posterior.support)
-    params = _unfolded(posterior, params, plain)
+    params = _unfolded(posterior, np.clip(params, *posterior.support), plain)
     if not np.isfinite(posterior.log_prob(params)):
         return Start(plain, PLAIN, matched)
     if trusted:
-        return Start(params, "matched peaks", matched)
-    first = climb(posterior, params, steps=STEPS)
-    if _lost(field, peaks, first.params[field.columns]) < LOST_AT_MOST:
-        return Start(first.params, "matched peaks and a first climb", matched)
+        return Start(settled(posterior, params, STEPS), "matched peaks", matched)
+    if _lost(field, peaks, z) < LOST_AT_MOST:
+        params = climb(explained(posterior, params), params, steps=STEPS).params
+        params = settled(posterior, params, STEPS)
+        if _lost(field, peaks, params[field.columns]) < LOST_AT_MOST:
+            return Start(params, "matched peaks and a first climb", matched)
     grown = _unfolded(posterior, outward(field, plain), plain)
-    second = climb(posterior, grown, steps=STEPS)
-    if second.log_prob > first.log_prob:
-        return Start(second.params, DISK, matched)
-    return Start(first.params, "matched peaks and a first climb", matched)
+    if posterior.log_prob(grown) > posterior.log_prob(params):
+        return Start(grown, DISK, matched)
+    return Start(params, "matched peaks", matched)
 
 
 def other_starts(posterior: Posterior, tried: Start) -> Iterator[Start]:
@@ -364,19 +366,20 @@ def outward(field: Field, params: Floats) -> Floats:
             continue
         part = _part(posterior, distance < radius + 4.0 * width, disk, width)
         index = [part.parameter_names.index(name) for name in posterior.parameter_names]
-        begin = part.start()
-        level = begin[part.parameter_names.index("background")]
-        begin[index] = params
-        begin[part.parameter_names.index("background")] = level
+        begin, background = part.start(), part.parameter_names.index("background")
+        begin[index] = np.clip(params, *posterior.support)
+        begin[background] = part.start()[background]
+        begin = _unfolded(part, begin, part.start())
         if not np.isfinite(part.log_prob(begin)):
             break
-        top = climb(part, begin, steps=STEPS)
+        top = climb(explained(part, begin), begin, steps=STEPS)
         if not np.isfinite(top.distance):
             break
         params, columns = top.params[index], [index[k] for k in field.columns]
         # photons measure bright stars better than the model is right: no star counts for more than a centroid
-        sources = field.everyone[inside]
-        covariance = top.covariance[np.ix_(columns, columns)] + field.fit(sources, predicted[sources], CENTROID * width)[1]
+        sources, places = field.everyone[inside], field.predict(params[field.columns])[inside]
+        params[field.columns], error = field.fit(sources, places, CENTROID * width)
+        covariance = top.covariance[np.ix_(columns, columns)] + error
     return params
 
 
