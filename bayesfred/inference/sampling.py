@@ -112,9 +112,11 @@ def sample(
             raise InputError(f"{path}: exists, expected a new file: resume the run in it (resume), or replace it (overwrite)")
         if resume and path.exists():
             check_same_posterior(path, posterior)
-            run = _Run.resumed(posterior, open_chain(path), random_states(path))
+            chain = open_chain(path)
+            run = _Run.resumed(posterior.near(chain.estimate.params, chain.estimate.covariance), chain, random_states(path))
         else:
             estimate = estimate or _find_map(posterior, progress)
+            posterior = posterior.near(estimate.params, estimate.covariance)
             run = _Run(posterior, estimate, path, seed, begin(posterior, estimate, seed, ensembles, walkers))
         with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin, and take half the likelihood's cores
             return run.until(target_ess, steps, progress)

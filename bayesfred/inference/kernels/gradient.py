@@ -219,10 +219,10 @@ def _background_gradient(counts, w, background, image, out):
 def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_background):
     """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`.
 
-    Returns the derivative with respect to position_scatter, NaN where the likelihood is zero.
+    Returns the derivative with respect to position_scatter, NaN where the likelihood is zero, and z.
     """
     if not drawn.extra + log_likelihood(counts, w, background) > -math.inf:
-        return math.nan
+        return math.nan, np.empty((0, 0))
     maps, fp, fluxes, sigma = drawn.maps, drawn.fitted.footprints, drawn.fitted.fluxes, nuisances[3]
     size = drawn.fitted.stamps.shape[0]
     curve = np.empty(w.image.size)
@@ -253,4 +253,4 @@ def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_b
                     moments[k] += dot(rows.out[k, :n], c[:n], ones[:n])
         for k in range(basis.row.size):
             out[k] += basis.lever[s, k] * moments[basis.row[k]]
-    return slope
+    return slope, z
