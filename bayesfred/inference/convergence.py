@@ -22,7 +22,7 @@ from scipy import fft
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-__all__ = ["autocorrelation", "convergence", "effective_size", "effective_sizes", "rank_rhat"]
+__all__ = ["autocorrelation", "convergence", "effective_size", "effective_sizes", "rank_rhat", "rhats"]
 
 TAIL = 0.05
 
@@ -132,13 +132,18 @@ def convergence(
     >>> bool(np.all(rhat < 1.02) and np.all(bulk > 1000) and np.all(bulk <= 1280))
     True
     """
+    return rhats(chain), *effective_sizes(chain)
+
+
+def rhats(chain: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R-hat of every parameter, as in `convergence`."""
     n_ensembles, n_steps, n_walkers, d = chain.shape
     rhat = np.full(d, np.inf)
     for k in range(d) if n_steps * n_walkers >= 4 else ():
         draws = np.asarray(chain[..., k], dtype=np.float64)
         if np.all(np.isfinite(draws)):
             rhat[k] = rank_rhat(draws.reshape(n_ensembles, -1))
-    return rhat, *effective_sizes(chain)
+    return rhat
 
 
 def effective_sizes(chain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -83,7 +83,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         weights: npt.ArrayLike = (1.0,),
         support: tuple[npt.ArrayLike, npt.ArrayLike] = (-np.inf, np.inf),
     ) -> None:
-        super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
+        # the proposal does not come from the ensemble, whatever its size: all walkers move at once
+        super().__init__(nsplits=1, randomize_split=False, live_dangerously=True)
         means = np.atleast_2d(mean)
         d = means.shape[1]
         low, high = (np.broadcast_to(bound, d) for bound in support)

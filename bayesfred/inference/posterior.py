@@ -42,7 +42,7 @@ _pool: ThreadPoolExecutor | None = None
 
 
 def _threads() -> ThreadPoolExecutor:
-    """The threads that share an ensemble's walkers; their number follows numba's setting."""
+    """The threads that share an ensemble's walkers with the calling one; their number follows numba's setting."""
     global _pool
     if _pool is None:
         _pool = ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, "bayesfred")
@@ -339,16 +339,16 @@ class Posterior:
         out = np.where(np.isnan(prior), -np.inf, prior)
         arguments = self._arguments(vectors)
         foretold = self._foretelling and self._foretelling.at(vectors)
-        threads = min(numba.get_num_threads(), len(vectors))
+        turn = np.zeros(1, np.int64)
 
-        def evaluate(first: int) -> None:
+        def evaluate() -> None:
             with self._workspace() as w:
-                log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, foretold, first, threads, out)
+                log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, foretold, turn, out)
 
-        if threads == 1:
-            evaluate(0)
-        else:
-            list(_threads().map(evaluate, range(threads)))
+        helpers = [_threads().submit(evaluate) for _ in range(min(numba.get_num_threads(), len(vectors)) - 1)]
+        evaluate()
+        for helper in helpers:
+            helper.result()
         out += np.where(np.isfinite(out), prior + self._constant, 0.0)
         out[np.isnan(prior)] = np.nan
         return out
@@ -445,11 +445,11 @@ class Posterior:
             out[:, k] /= arguments[1][0]
         return out[np.ix_(self._order, self._order)]
 
-    def information(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information plus the prior's curvature: the inverse is the Laplace approximation's covariance."""
+    def information(self, params: npt.ArrayLike, fisher: Floats | None = None) -> Floats:
+        """Fisher information, if not given, plus the prior's curvature: the inverse is the Laplace approximation's covariance."""
         vector = self._vectors(params)[0]
         curvature = [max(priors.slope(p, x)[1], 0.0) for p, x in zip(self.prior.values(), vector, strict=True)]
-        return self.fisher(vector) + np.diag(curvature)
+        return (self.fisher(vector) if fisher is None else fisher) + np.diag(curvature)
 
     def simulate(self, params: npt.ArrayLike, rng: np.random.Generator) -> Floats | None:
         """Draw a frame given the parameters; what is not sampled, free fluxes and the sources' shifts, is drawn from its prior.

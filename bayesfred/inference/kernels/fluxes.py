@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner, take_turn
 from bayesfred.imaging.kernels.images import add_source, add_templates
 from bayesfred.imaging.kernels.maps import Footprints, Maps, footprints, locate, move, new_maps, new_work, row_starts
 from bayesfred.inference.kernels.clusters import (
@@ -306,12 +306,16 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
 
 
 @nb.njit(cache=True, nogil=True)
-def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, foretold, first, step, out):
-    """Log-likelihoods of rows first, first + step, ... into `out`; rows where it is -inf already are left alone.
+def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, foretold, turn, out):
+    """Log-likelihoods of rows into `out`; rows where it is -inf already are left alone.
 
-    `foretold` is None, or fluxes from which their maximum is near.
+    `foretold` is None, or fluxes near their maximum. Each row is whose turn it is: threads that share `turn` share the rows, and
+    one that is held up takes fewer.
     """
-    for i in range(first, out.size, step):
+    while True:
+        i = take_turn(turn)
+        if i >= out.size:
+            break
         if out[i] > -math.inf:
             value = math.nan
             if foretold is not None:
