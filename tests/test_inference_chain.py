@@ -541,15 +541,14 @@ def test_the_posterior_is_rebuilt(
 @pytest.mark.parametrize("effective", [0.0, 1e-15, 1e-3])
 def test_walkers_that_hardly_move_leave_half_the_run_out(monkeypatch: pytest.MonkeyPatch, effective: float) -> None:
     """However long the correlation is; 1/effective overflows no logarithm."""
-    sizes = np.full(2, effective)
-    monkeypatch.setattr(sampling, "effective_sizes", lambda _: (sizes, sizes))
+    monkeypatch.setattr(sampling, "bulk_sizes", lambda _: np.full(2, effective))
     assert burn_in(np.random.default_rng(1).standard_normal((4, 80, 8, 2))) == 40
 
 
 @pytest.mark.parametrize(("tau", "left_out"), [(1.0, 0), (1.2, 1), (3.0, 4), (9.0, 13)])
 def test_the_first_step_that_is_kept_has_forgotten_the_start(monkeypatch: pytest.MonkeyPatch, tau: float, left_out: int) -> None:
     chain = np.random.default_rng(1).standard_normal((4, 80, 8, 2))
-    monkeypatch.setattr(sampling, "effective_sizes", lambda kept: (np.full(2, kept[..., 0].size / tau),) * 2)
+    monkeypatch.setattr(sampling, "bulk_sizes", lambda kept: np.full(2, kept[..., 0].size / tau))
     r = (tau - 1.0) / (tau + 1.0)
     assert burn_in(chain) == left_out and r ** (left_out + 1) <= 0.05 < max(r, 1e-9) ** left_out
 

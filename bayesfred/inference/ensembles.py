@@ -27,7 +27,7 @@ from bayesfred.inference.posterior import Posterior
 Floats = npt.NDArray[np.float64]
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
-POOR = 0.15  # share of accepted moves below which proposals are made anew
+POOR = 0.3  # share of accepted moves below which proposals are made anew; half of them by differential evolution bring 0.15 alone
 LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which it is looked at, over the latter half of them
 DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be made anew
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run

@@ -177,4 +177,5 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     def get_proposal(self, s: Floats, c: Sequence[Floats], random: np.random.RandomState) -> tuple[Floats, Floats]:
         """New positions for the walkers at s, and log q(s) - log q(new); the other walkers c are not used."""
         new = self.draw(len(s), random)
-        return new, self.log_density(s) - self.log_density(new)
+        before, after = np.split(self.log_density(np.concatenate([s, new])), 2)
+        return new, before - after

@@ -28,7 +28,7 @@ from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.inference.chainfile import Chain, check_same_posterior, open_chain, random_states, write_chain
-from bayesfred.inference.convergence import effective_sizes, rhats
+from bayesfred.inference.convergence import bulk_sizes, effective_sizes, rhats
 from bayesfred.inference.ensembles import Step, adapted, advance, begin, check_start
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.lock import only_writer
@@ -150,7 +150,7 @@ def burn_in(chain: Floats) -> int:
     made: int = min(adapted(chain), chain.shape[1] - 1)
     n_steps: int = chain.shape[1] - made
     kept = chain[:, made + n_steps // 4 :]
-    effective = float(np.min(effective_sizes(kept)))
+    effective = float(np.min(bulk_sizes(kept)))
     draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
     half = n_steps // 2
     if not effective * half > draws:  # tau is longer

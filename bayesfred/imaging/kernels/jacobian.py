@@ -97,16 +97,16 @@ def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, d
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) / sigma
 
 
-@nb.njit(inline="always")
-def _samples_row(o, sigma, weight, template, t, ra, rb, rd, e, size, signed, along_a, along_b):
-    """P |D|, s P, P_a |D| and P_b |D| of a template at t = u - u_peak from `t` on, the names being those of `basis_row`."""
-    _polynomial_row(along_a, o.ramp, t, ra, o.degree)
-    _polynomial_row(along_b, o.ramp, t, rb, o.degree)
+@inner(cache=True, fastmath=FAST, error_model="numpy")
+def _samples_row(psf, sigma, weight, template, ramp, t, ra, rb, rd, degree, d_degree, e, size, signed, along_a, along_b):
+    """P |D|, s P, P_a |D| and P_b |D| of a template at u - u_peak from t on, the names being those of `basis_row`."""
+    _polynomial_row(along_a, ramp, t, ra, degree)
+    _polynomial_row(along_b, ramp, t, rb, degree)
     if template == 0:
-        _slopes_row(o.psf, sigma, weight, e, along_a, along_b)
+        _slopes_row(psf, sigma, weight, e, along_a, along_b)
     else:
-        _bends_row(o.psf, sigma, weight, template == 1, e, along_a, along_b)
-    _polynomial_row(signed, o.ramp, t, rd, o.d_degree)
+        _bends_row(psf, sigma, weight, template == 1, e, along_a, along_b)
+    _polynomial_row(signed, ramp, t, rd, d_degree)
     _times_absolute(along_a, along_b, signed)
     _times_determinant(e, size, signed)
 
@@ -179,7 +179,9 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             u = u_row + o.offsets[p]
             t = u - maps.peak[s, 0]
             weight = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
-            _samples_row(o, sigma, weight, template, t, ra, rb, rd, e, size, signed, along_a, along_b)
+            _samples_row(
+                o.psf, sigma, weight, template, ramp, t, ra, rb, rd, o.degree, o.d_degree, e, size, signed, along_a, along_b
+            )
             if conserve:
                 _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
                 _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.degree)
@@ -298,7 +300,9 @@ def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples,
             for p in range(offsets.size):
                 t = (fp.low[r] - 0.5 * (o.nx - 1)) * o.step + offsets[p] - h
                 norm = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
-                _samples_row(o, sigma, norm, template, t, ra, rb, rd, e, size, signed, along_a, along_b)
+                _samples_row(
+                    o.psf, sigma, norm, template, ramp, t, ra, rb, rd, o.degree, o.d_degree, e, size, signed, along_a, along_b
+                )
                 flux += _weigh_row(own, size, along_a, along_b, signed)
                 power[:] = 1.0
                 for m in range(0, 2 * top, 2):
