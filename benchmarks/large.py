@@ -90,6 +90,7 @@ def main() -> int:
     split.watch(bf.Posterior, "fisher", "Fisher information")
     split.watch(estimate, "find_start", "peaks, matching")
     split.watch(estimate, "goodness", "deviance at the maximum")
+    split.watch(sampling, "bulk_sizes", "checks for convergence")
     split.watch(sampling, "effective_sizes", "checks for convergence")
     split.watch(sampling, "write_chain", "checkpoints")
     top = split.run("rest of the search", bf.find_map, posterior)

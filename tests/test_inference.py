@@ -3,6 +3,7 @@
 import math
 import queue
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba as nb
@@ -16,7 +17,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, exp2, log
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE, exp2, log, take_turn
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise, simulate
@@ -237,6 +238,23 @@ def test_exp2_is_exact_to_rounding() -> None:
     x = np.concatenate([np.random.default_rng(1).uniform(-1000, 1000, 400_000), [-1000.0, 0.0, 999.0]])
     exact = np.exp2(x.astype(np.longdouble))
     assert np.abs(vectorised(exp2, FAST)(x) / exact - 1).max() < 3e-16
+
+
+def test_threads_that_take_turns_miss_and_repeat_none() -> None:
+    @nb.njit(nogil=True)
+    def take(turn: Any, taken: Any) -> Any:
+        mine, i = 0, take_turn(turn)
+        while i < taken.size:
+            taken[i] += 1
+            mine += 1
+            i = take_turn(turn)
+        return mine
+
+    turn, taken = np.zeros(1, np.int64), np.zeros(10_000_000, np.int8)
+    take(turn.copy(), taken[:0])  # compiled before the threads start
+    with ThreadPoolExecutor(4) as pool:
+        shares = list(pool.map(lambda _: take(turn, taken), range(4)))
+    assert np.all(taken == 1) and sum(shares) == taken.size
 
 
 # --- log-posterior ----------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference import ensembles, examine, sampling
 from bayesfred.inference.chainfile import Chain, fingerprint, open_chain, random_states, write_chain
+from bayesfred.inference.ensembles import adapted
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.noise import BackgroundNoise, PoissonNoise
 from bayesfred.inference.posterior import Nuisances, Posterior
@@ -289,7 +290,7 @@ def test_an_estimate_off_the_posterior_is_refused(posterior: Posterior, estimate
 # --- accidents, of which test_inference_accidents.py has more ------------------------------------------------
 
 
-CALLS_OF_A_STEP = 4  # 2 an ensemble
+CALLS_OF_A_STEP = 2  # one an ensemble, before the first look
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, bad: Mapping[int, float], first: int = 2) -> None:
@@ -307,11 +308,11 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, bad: Mapping[int, float], first: int
     monkeypatch.setattr(Posterior, "unchecked_log_prob", spoil)
 
 
-@pytest.mark.parametrize("calls", [3, 6, 7, 20, 37])
+@pytest.mark.parametrize("calls", [3, 4, 5, 11, 17])
 def test_an_interrupted_run_keeps_its_complete_steps(
     posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
-    # 2 calls place the walkers, emcee evaluates none again, and a step is 2 calls an ensemble
+    # 2 calls place the walkers, emcee evaluates none again, and before the first look a step is a call an ensemble
     path, real, left = tmp_path / "chain.h5", Posterior.unchecked_log_prob, calls
 
     def interrupted(self: Posterior, params: Any) -> Any:
@@ -325,7 +326,7 @@ def test_an_interrupted_run_keeps_its_complete_steps(
         patch.setattr(Posterior, "unchecked_log_prob", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(posterior, whole.estimate, path)
-    complete = (calls - 2) // 4
+    complete = (calls - 2) // 2
     assert path.exists() == (complete > 0)
     if complete:
         kept = open_chain(path)
@@ -341,7 +342,7 @@ def test_an_interrupted_run_keeps_its_complete_steps(
 def test_what_is_no_density_is_refused_and_counted(
     posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bad = {3: math.nan, 7: math.inf, 8: math.nan, 40: math.inf, 41: -math.inf}
+    bad = {3: math.nan, 7: math.inf, 8: math.nan, 20: math.inf, 21: -math.inf}
     with monkeypatch.context() as patch:
         spoilt(patch, bad)
         chain = run(posterior, whole.estimate, tmp_path / "a.h5")
@@ -540,6 +541,21 @@ def test_the_posterior_is_rebuilt(
 @pytest.mark.parametrize("effective", [0.0, 1e-15, 1e-3])
 def test_walkers_that_hardly_move_leave_half_the_run_out(monkeypatch: pytest.MonkeyPatch, effective: float) -> None:
     """However long the correlation is; 1/effective overflows no logarithm."""
-    sizes = np.full(2, effective)
-    monkeypatch.setattr(sampling, "effective_sizes", lambda _: (sizes, sizes))
+    monkeypatch.setattr(sampling, "bulk_sizes", lambda _: np.full(2, effective))
     assert burn_in(np.random.default_rng(1).standard_normal((4, 80, 8, 2))) == 40
+
+
+@pytest.mark.parametrize(("tau", "left_out"), [(1.0, 0), (1.2, 1), (3.0, 4), (9.0, 13)])
+def test_the_first_step_that_is_kept_has_forgotten_the_start(monkeypatch: pytest.MonkeyPatch, tau: float, left_out: int) -> None:
+    chain = np.random.default_rng(1).standard_normal((4, 80, 8, 2))
+    monkeypatch.setattr(sampling, "bulk_sizes", lambda kept: np.full(2, kept[..., 0].size / tau))
+    r = (tau - 1.0) / (tau + 1.0)
+    assert burn_in(chain) == left_out and r ** (left_out + 1) <= 0.05 < max(r, 1e-9) ** left_out
+
+
+def test_differential_evolution_begins_after_the_first_look(posterior: Posterior, whole: Chain) -> None:
+    shares = [
+        {type(move): share for move, share in ensembles._moves(posterior, whole.estimate, whole.chain[:, :n])}[emcee.moves.DEMove]
+        for n in (0, 1, 7, 8, 12)
+    ]
+    assert adapted(whole.chain) == 0 and shares == [0.0, 0.0, 0.0, ensembles.DE_SHARE, ensembles.DE_SHARE]

@@ -237,6 +237,20 @@ def test_map_of_the_papers_noise_is_its_least_squares() -> None:
     assert (best.params[:-1] - truth[:-1]) / error == pytest.approx(fit.x, abs=2e-3)
 
 
+def test_the_information_is_worked_out_once_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_model(tolerance=1e-8)
+    posterior = Posterior(model, simulate(model, np.zeros(12), 3.0, seed=34))
+    real, places = Posterior.fisher, []
+
+    def fisher(self: Posterior, params: Any) -> Any:
+        places.append(np.asarray(params).tobytes())
+        return real(self, params)
+
+    monkeypatch.setattr(Posterior, "fisher", fisher)
+    assert find_map(posterior, posterior.start()).converged
+    assert len(places) == len(set(places)) > 1
+
+
 def test_undetermined_parameters_are_named() -> None:
     model = make_model(SourceCatalog([20.0], [10.0], [4e3]), tolerance=1e-8)
     posterior = Posterior(model, simulate(model, np.zeros(12), 3.0, seed=34))

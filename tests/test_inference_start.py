@@ -216,7 +216,9 @@ def test_a_climb_that_ends_at_no_maximum_begins_anew(monkeypatch: pytest.MonkeyP
     posterior = Posterior(model, simulate(model, np.zeros(12), 2.0, seed=7))
     begun = start.find_start(posterior)
     lost = Ascent(begun.params, float(posterior.log_prob(begun.params)), np.full((13, 13), np.nan), np.inf, 9)
-    monkeypatch.setattr(estimate, "climb", lambda p, begin: lost if np.array_equal(begin, begun.params) else climb(p, begin))
+    monkeypatch.setattr(
+        estimate, "climb", lambda p, begin, **known: lost if np.array_equal(begin, begun.params) else climb(p, begin)
+    )
     found = find_map(posterior)
     assert found.converged and "the prior's medians" in found.message
     assert found.n_evaluations > lost.evaluations

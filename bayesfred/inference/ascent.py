@@ -47,8 +47,20 @@ class Ascent(NamedTuple):
     evaluations: int
 
 
-def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> Ascent:
+def climb(posterior: Posterior, start: Floats, *, steps: int | None = None, fisher: Floats | None = None) -> Ascent:
     """The maximum above a start at which the posterior has density, or where so many Newton steps towards it lead.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    start : ndarray, shape (d,)
+    steps : int, optional
+    fisher : ndarray, shape (d, d), optional
+        The Fisher information at the start, where it is known already.
+
+    Returns
+    -------
+    Ascent
 
     References
     ----------
@@ -58,7 +70,8 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
     low, high = posterior.support
     while True:
         gradient = posterior.gradient(params)
-        information = _information(posterior, params, gradient)
+        information = _information(posterior, params, gradient, fisher)
+        fisher = None
         scale = 1.0 / np.sqrt(np.diag(information))  # rows differ in scale by many orders of magnitude
         try:
             lower = linalg.cholesky(information * np.outer(scale, scale), lower=True)
@@ -99,13 +112,13 @@ def climb(posterior: Posterior, start: Floats, *, steps: int | None = None) -> A
     return Ascent(params, float(posterior.log_prob(params)), whiten @ whiten.T, distance, evaluations)
 
 
-def _information(posterior: Posterior, params: Floats, gradient: Floats) -> Floats:
+def _information(posterior: Posterior, params: Floats, gradient: Floats, fisher: Floats | None) -> Floats:
     """Fisher information plus prior curvature, as far as it describes the posterior where a prior's support ends.
 
     Where the background has no counts, the log-posterior falls linearly from its edge, while the information about it has no bound.
     A fall by exp(-g x) has the standard deviation 1/g; it stands for information that foretells less.
     """
-    information = posterior.information(params)
+    information = posterior.information(params, fisher)
     known = np.diag(information).copy()
     room = np.where(gradient < 0.0, params - posterior.support[0], posterior.support[1] - params)  # towards which it climbs
     for k in np.flatnonzero((room * np.sqrt(known) <= 1.0) | (room <= 0.0)):

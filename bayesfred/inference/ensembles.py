@@ -26,8 +26,8 @@ from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
 
-DE_SHARE = 0.05  # of the steps move by differential evolution
-POOR = 0.15  # share of accepted moves below which proposals are made anew
+DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
+POOR = 0.3  # share of accepted moves below which proposals are made anew; half of them by differential evolution bring 0.15 alone
 LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which it is looked at, over the latter half of them
 DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be made anew
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
@@ -149,8 +149,12 @@ def adapted(chain: Floats) -> int:
 
 
 def _moves(posterior: Posterior, estimate: MapEstimate, chain: Floats) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves that make the step after those in the chain, each with its share."""
-    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE
+    """The moves that make the step after those in the chain, each with its share.
+
+    Differential evolution frees walkers that stand where they are hardly ever proposed a likelier place. That shows in time:
+    before the first look it would only cost draws.
+    """
+    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= LOOKS[0])
     if made := adapted(chain):
         draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
         share = DE_SHARE_ADAPTED

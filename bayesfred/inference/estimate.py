@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy import linalg
+from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.inference import priors
@@ -84,16 +85,16 @@ class MapEstimate:
         )
 
 
-def undetermined(posterior: Posterior, params: Floats) -> tuple[str, ...]:
+def undetermined(posterior: Posterior, params: Floats, fisher: Floats) -> tuple[str, ...]:
     """Parameters about which neither the frame nor a prior that was given says anything.
 
     With S the default priors' standard deviations, the eigenvalues of S I S compare, direction by direction, what is known
-    with what the default priors know; I is the Fisher information plus what the given priors know more than the default ones.
-    The names are those that make up the directions whose eigenvalue is below `LEAST_INFORMATION`.
+    with what the default priors know; I is the Fisher information, `fisher`, plus what the given priors know more than the
+    default ones. The names are those that make up the directions whose eigenvalue is below `LEAST_INFORMATION`.
     """
     sd = np.array([posterior.default_prior(name).std() for name in posterior.parameter_names])
     given = np.array([priors.slope(p, x)[1] for p, x in zip(posterior.prior.values(), params, strict=True)])
-    information = posterior.fisher(params) + np.diag(np.maximum(given - sd**-2.0, 0.0))
+    information = fisher + np.diag(np.maximum(given - sd**-2.0, 0.0))
     values, vectors = np.linalg.eigh(information * np.outer(sd, sd))
     lost = (values < LEAST_INFORMATION) & (_effect(posterior, sd, vectors) > LEAST_EFFECT)
     weak = (vectors[:, lost] ** 2).sum(axis=1) > 0.1
@@ -150,6 +151,11 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     >>> find_map(posterior).converged
     True
     """
+    with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin, and take the cores from what is at work
+        return _find_map(posterior, start)
+
+
+def _find_map(posterior: Posterior, start: Sequence[float] | Floats | None) -> MapEstimate:
     if start is None:
         begun = find_start(posterior)
         origin = begun.params
@@ -158,13 +164,14 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
         origin, how = np.array(start, dtype=np.float64), ""
     if not np.isfinite(posterior.log_prob(origin)):
         raise InputError("start: the posterior has no density there, expected parameters within the prior whose map does not fold")
-    weak = undetermined(posterior, origin)
+    fisher = posterior.fisher(origin)
+    weak = undetermined(posterior, origin, fisher)
     if weak:
         raise InputError(
             f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than their "
             "noise: leave out terms, add sources, or give these parameters a narrower prior"
         )
-    top = climb(posterior, origin)
+    top = climb(posterior, origin, fisher=fisher)
     evaluations = top.evaluations
     if start is None and top.distance >= CLOSENESS:
         for other in other_starts(posterior, begun):

@@ -83,7 +83,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         weights: npt.ArrayLike = (1.0,),
         support: tuple[npt.ArrayLike, npt.ArrayLike] = (-np.inf, np.inf),
     ) -> None:
-        super().__init__(live_dangerously=True)  # the proposal does not come from the ensemble, whatever its size
+        # the proposal does not come from the ensemble, whatever its size: all walkers move at once
+        super().__init__(nsplits=1, randomize_split=False, live_dangerously=True)
         means = np.atleast_2d(mean)
         d = means.shape[1]
         low, high = (np.broadcast_to(bound, d) for bound in support)
@@ -176,4 +177,5 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     def get_proposal(self, s: Floats, c: Sequence[Floats], random: np.random.RandomState) -> tuple[Floats, Floats]:
         """New positions for the walkers at s, and log q(s) - log q(new); the other walkers c are not used."""
         new = self.draw(len(s), random)
-        return new, self.log_density(s) - self.log_density(new)
+        before, after = np.split(self.log_density(np.concatenate([s, new])), 2)
+        return new, before - after

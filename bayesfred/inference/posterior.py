@@ -4,6 +4,7 @@ Parameters are the distortion coefficients, the background and whatever `Nuisanc
 derivatives are in `kernels`; `estimate.py` finds the maximum, `sampling.py` draws.
 """
 
+import copy
 import os
 import queue
 from collections.abc import Callable, Iterator, Mapping
@@ -11,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numba
 import numpy as np
@@ -24,6 +25,7 @@ from bayesfred.imaging.kernels.images import image
 from bayesfred.imaging.kernels.jacobian import Basis
 from bayesfred.imaging.kernels.maps import SEGMENT, Optics, stride
 from bayesfred.inference import priors
+from bayesfred.inference.foretelling import Foretelling, foretelling
 from bayesfred.inference.kernels.fisher import fisher
 from bayesfred.inference.kernels.fluxes import Drawn, draw, log_likelihoods
 from bayesfred.inference.kernels.gradient import gradient
@@ -40,7 +42,7 @@ _pool: ThreadPoolExecutor | None = None
 
 
 def _threads() -> ThreadPoolExecutor:
-    """The threads that share an ensemble's walkers; their number follows numba's setting."""
+    """The threads that share an ensemble's walkers with the calling one; their number follows numba's setting."""
     global _pool
     if _pool is None:
         _pool = ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, "bayesfred")
@@ -252,6 +254,8 @@ class Posterior:
     mask: npt.NDArray[np.bool_]
     nuisances: Nuisances
 
+    _foretelling: ClassVar[Foretelling | None] = None
+
     def __init__(
         self,
         model: ForwardModel,
@@ -334,19 +338,47 @@ class Posterior:
         prior = self.log_prior(vectors)
         out = np.where(np.isnan(prior), -np.inf, prior)
         arguments = self._arguments(vectors)
-        threads = min(numba.get_num_threads(), len(vectors))
+        foretold = self._foretelling and self._foretelling.at(vectors)
+        turn = np.zeros(1, np.int64)
 
-        def evaluate(first: int) -> None:
+        def evaluate() -> None:
             with self._workspace() as w:
-                log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, first, threads, out)
+                log_likelihoods(self._optics, self._frame, w, *arguments, self._flux, self._free, foretold, turn, out)
 
-        if threads == 1:
-            evaluate(0)
-        else:
-            list(_threads().map(evaluate, range(threads)))
+        helpers = [_threads().submit(evaluate) for _ in range(min(numba.get_num_threads(), len(vectors)) - 1)]
+        evaluate()
+        for helper in helpers:
+            helper.result()
         out += np.where(np.isfinite(out), prior + self._constant, 0.0)
         out[np.isnan(prior)] = np.nan
         return out
+
+    def near(self, params: Floats, covariance: Floats) -> "Posterior":
+        """The same posterior, with a `log_prob` that is several times faster around `params` where fluxes are free.
+
+        It foretells the most likely fluxes from those at `params`. Where that fails it looks for them as usual; values differ by
+        rounding and at most 5e-5, by less than 1e-6 within a few standard deviations.
+
+        Parameters
+        ----------
+        params : ndarray, shape (d,)
+        covariance : ndarray, shape (d, d)
+            How far around.
+
+        Returns
+        -------
+        Posterior
+        """
+        if self.nuisances.profiled != 1:
+            return self
+        arguments = [a[0] for a in self._arguments(self._vectors(params))]
+        unused = np.zeros(self._basis.row.size), np.zeros(6)
+        with self._drawn(arguments) as (w, drawn):
+            slope, z = gradient(self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, *unused)
+        close = copy.copy(self)
+        if np.isfinite(slope):
+            object.__setattr__(close, "_foretelling", foretelling(self.fluxes, drawn.fitted, z[:, 0], params, covariance))
+        return close
 
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
@@ -366,7 +398,7 @@ class Posterior:
         arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
         with self._drawn(arguments) as (w, drawn):
-            slope = gradient(self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background)
+            slope, _ = gradient(self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis, sources, background)
         if np.isnan(slope):
             return np.full(vector.size, np.nan)
         if isinstance(self.noise, BackgroundNoise):
@@ -413,11 +445,11 @@ class Posterior:
             out[:, k] /= arguments[1][0]
         return out[np.ix_(self._order, self._order)]
 
-    def information(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information plus the prior's curvature: the inverse is the Laplace approximation's covariance."""
+    def information(self, params: npt.ArrayLike, fisher: Floats | None = None) -> Floats:
+        """Fisher information, if not given, plus the prior's curvature: the inverse is the Laplace approximation's covariance."""
         vector = self._vectors(params)[0]
         curvature = [max(priors.slope(p, x)[1], 0.0) for p, x in zip(self.prior.values(), vector, strict=True)]
-        return self.fisher(vector) + np.diag(curvature)
+        return (self.fisher(vector) if fisher is None else fisher) + np.diag(curvature)
 
     def simulate(self, params: npt.ArrayLike, rng: np.random.Generator) -> Floats | None:
         """Draw a frame given the parameters; what is not sampled, free fluxes and the sources' shifts, is drawn from its prior.

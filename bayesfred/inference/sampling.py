@@ -28,7 +28,7 @@ from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.inference.chainfile import Chain, check_same_posterior, open_chain, random_states, write_chain
-from bayesfred.inference.convergence import convergence, effective_sizes
+from bayesfred.inference.convergence import bulk_sizes, effective_sizes, rhats
 from bayesfred.inference.ensembles import Step, adapted, advance, begin, check_start
 from bayesfred.inference.estimate import MapEstimate, find_map
 from bayesfred.inference.lock import only_writer
@@ -107,17 +107,19 @@ def sample(
     _check_numbers(ensembles, walkers, target_ess, steps)
     if not path.parent.is_dir():
         raise InputError(f"{path}: no folder {path.parent}, expected one to write the chain to: create it")
-    with only_writer(path):
+    # idle BLAS threads spin, and take half the likelihood's cores
+    with only_writer(path), threadpool_limits(1, user_api="blas"):
         if path.exists() and not (resume or overwrite):
             raise InputError(f"{path}: exists, expected a new file: resume the run in it (resume), or replace it (overwrite)")
         if resume and path.exists():
             check_same_posterior(path, posterior)
-            run = _Run.resumed(posterior, open_chain(path), random_states(path))
+            chain = open_chain(path)
+            run = _Run.resumed(posterior.near(chain.estimate.params, chain.estimate.covariance), chain, random_states(path))
         else:
             estimate = estimate or _find_map(posterior, progress)
+            posterior = posterior.near(estimate.params, estimate.covariance)
             run = _Run(posterior, estimate, path, seed, begin(posterior, estimate, seed, ensembles, walkers))
-        with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin, and take half the likelihood's cores
-            return run.until(target_ess, steps, progress)
+        return run.until(target_ess, steps, progress)
 
 
 def _find_map(posterior: Posterior, progress: bool) -> MapEstimate:
@@ -142,19 +144,19 @@ def burn_in(chain: Floats) -> int:
     """Steps to leave out: those before the proposals were made for the last time, and of the others at most half.
 
     Walkers start from the Laplace approximation, so what must be forgotten is its difference from the posterior. Were the slowest
-    parameter's correlations r^k after k steps, its autocorrelation time would be tau = (1 + r)/(1 - r); the steps are those
-    after which a twentieth is left, r^k = 1/20.
+    parameter's correlations r^k after k steps, its autocorrelation time would be tau = (1 + r)/(1 - r); the first step that is
+    kept is the one after which at most a twentieth is left, r^k <= 1/20.
     """
     made: int = min(adapted(chain), chain.shape[1] - 1)
     n_steps: int = chain.shape[1] - made
     kept = chain[:, made + n_steps // 4 :]
-    effective = float(np.min(effective_sizes(kept)))
+    effective = float(np.min(bulk_sizes(kept)))
     draws = kept.shape[0] * kept.shape[1] * kept.shape[2]
     half = n_steps // 2
     if not effective * half > draws:  # tau is longer
         return made + half
     tau = max(draws / effective, 1.1)
-    return made + min(half, math.ceil(math.log(20.0) / math.log((tau + 1.0) / (tau - 1.0))))
+    return made + min(half, math.ceil(math.log(20.0) / math.log((tau + 1.0) / (tau - 1.0))) - 1)
 
 
 def versions() -> dict[str, str]:
@@ -246,7 +248,7 @@ class _Run:
         if draws < target_ess:  # effective draws are not more than draws
             return False, draws / target_ess
         share = float(np.min(effective_sizes(kept)) / target_ess)
-        return bool(share >= 1.0 and convergence(kept)[0].max() <= RHAT), share
+        return bool(share >= 1.0 and rhats(kept).max() <= RHAT), share
 
     def _unfinished(self, target_ess: float) -> Chain:
         """The run so far, with the most burn-in there can be, because finding the right one takes longer than to save it."""

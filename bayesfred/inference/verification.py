@@ -62,7 +62,7 @@ def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
         _posterior(path, posterior),
         _log_prob(chain, posterior, every_draw),
         *_maximum(chain, posterior),
-        *_steps(chain, posterior),
+        *_steps(chain, posterior.near(chain.estimate.params, chain.estimate.covariance)),
     ]
 
 

@@ -1,4 +1,4 @@
-"""What compiled functions are decorated with, and exp2 and log in a form that vectorises."""
+"""What compiled functions are decorated with, exp2 and log in a form that vectorises, and a counter that threads share."""
 
 from functools import partial
 from typing import Any
@@ -36,6 +36,17 @@ def as_bits(typingctx: Any, value: Any) -> Any:
         return builder.bitcast(args[0], ir.IntType(64))
 
     return nb.types.int64(nb.types.float64), codegen
+
+
+@intrinsic
+def take_turn(typingctx: Any, turn: Any) -> Any:
+    """The int64 that an array begins with, raised by one in the same instant: no two threads get the same."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return nb.types.int64(turn), codegen
 
 
 @nb.njit(fastmath=FAST, inline="always")

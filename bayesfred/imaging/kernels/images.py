@@ -15,8 +15,11 @@ BATCH = 32  # sources whose rows are listed at a time: of many sources the list 
 
 
 @inner(cache=True, fastmath=FAST, error_model="numpy")
-def add_source(o, maps, fp, s, sigma, flux, at, out, work):
-    """Add source s to `out`, the samples of row i from at[i] on."""
+def add_source(o, maps, fp, s, first, last, sigma, flux, at, out, work, place, stamps):
+    """Add the rows of source s from `first` to `last` to `out`, the samples of row i from at[i] on.
+
+    With `stamps` the source alone is left there, row i from place[i] on.
+    """
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this function: a call costs more
     # than a short row.
     d, u, v = maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
@@ -25,10 +28,11 @@ def add_source(o, maps, fp, s, sigma, flux, at, out, work):
     r, rd, r2, ramp, psf = work[0], work[1], work[2], o.ramp, o.psf
     d_top = len(o.d_degree)
     norm = flux * psf.norm / (sigma * sigma)
-    for i in range(fp.first[s], fp.first[s + 1]):
+    for i in range(first, last):
         w = (rows[i] - middle_v) * step - v
         t_low = (lows[i] - middle_u) * step - u
         row = out[at[i] : at[i] + sizes[i]]
+        stamp = None if stamps is None else stamps[place[i] : place[i] + sizes[i]]
         for y in range(offsets.size):
             psf_arguments(psf, maps, s, w + offsets[y], sigma, work, o.degree, o.q_degree)
             for x in range(offsets.size):
@@ -39,7 +43,10 @@ def add_source(o, maps, fp, s, sigma, flux, at, out, work):
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
-                    row[n] += psf_value(psf, t, r, r2, o.degree, o.q_degree) * abs(j)
+                    value = psf_value(psf, t, r, r2, o.degree, o.q_degree) * abs(j)
+                    row[n] += value
+                    if stamps is not None:
+                        stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)
 
 
 @inner(cache=True, fastmath=FAST, error_model="numpy")
@@ -88,5 +95,5 @@ def image(o, theta, offset_x, offset_y, sigma, flux, out):
         fp = footprints(o, part)
         at = row_starts(fp, out.size // o.ny)
         for i in range(part.peak.shape[0]):
-            add_source(o, part, fp, i, sigma, flux[s + i], at, out, work)
+            add_source(o, part, fp, i, fp.first[i], fp.first[i + 1], sigma, flux[s + i], at, out, work, None, None)
     return unfolded

@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner
 from bayesfred.imaging.kernels.maps import footprints, locate, new_maps, new_work
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.profiles import psf_bends, psf_slopes
@@ -97,6 +97,20 @@ def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, d
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) / sigma
 
 
+@inner(cache=True, fastmath=FAST, error_model="numpy")
+def _samples_row(psf, sigma, weight, template, ramp, t, ra, rb, rd, degree, d_degree, e, size, signed, along_a, along_b):
+    """P |D|, s P, P_a |D| and P_b |D| of a template at u - u_peak from t on, the names being those of `basis_row`."""
+    _polynomial_row(along_a, ramp, t, ra, degree)
+    _polynomial_row(along_b, ramp, t, rb, degree)
+    if template == 0:
+        _slopes_row(psf, sigma, weight, e, along_a, along_b)
+    else:
+        _bends_row(psf, sigma, weight, template == 1, e, along_a, along_b)
+    _polynomial_row(signed, ramp, t, rd, d_degree)
+    _times_absolute(along_a, along_b, signed)
+    _times_determinant(e, size, signed)
+
+
 @nb.njit(inline="always")
 def _add_row_of(out, row):
     for i in range(row.size):
@@ -165,15 +179,9 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             u = u_row + o.offsets[p]
             t = u - maps.peak[s, 0]
             weight = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
-            _polynomial_row(along_a, ramp, t, ra, o.degree)
-            _polynomial_row(along_b, ramp, t, rb, o.degree)
-            if template == 0:
-                _slopes_row(o.psf, sigma, weight, e, along_a, along_b)
-            else:
-                _bends_row(o.psf, sigma, weight, template == 1, e, along_a, along_b)
-            _polynomial_row(signed, ramp, t, rd, o.d_degree)
-            _times_absolute(along_a, along_b, signed)
-            _times_determinant(e, size, signed)
+            _samples_row(
+                o.psf, sigma, weight, template, ramp, t, ra, rb, rd, o.degree, o.d_degree, e, size, signed, along_a, along_b
+            )
             if conserve:
                 _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
                 _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.degree)
@@ -191,6 +199,134 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             _powers_row(powers, ramp, u, n)
             _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
+
+
+@inner(cache=True, fastmath=REDUCE)
+def _weigh_row(weight, size, a, b, e):
+    """Multiply a, b and e by the weight; returns the sum of weight times size."""
+    total = 0.0
+    for i in range(weight.size):
+        total += weight[i] * size[i]
+        a[i] *= weight[i]
+        b[i] *= weight[i]
+        e[i] *= weight[i]
+    return total
+
+
+@inner(cache=True, fastmath=REDUCE)
+def _two_moments(power, ramp, t0, a, b, e, out):
+    """Sums of a, b and e times power and times power t, at t = t0 + ramp[i], into the columns of out; power becomes power t^2."""
+    a0, a1, b0, b1, e0, e1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(power.size):
+        t, p = t0 + ramp[i], power[i]
+        q = p * t
+        a0 += p * a[i]
+        a1 += q * a[i]
+        b0 += p * b[i]
+        b1 += q * b[i]
+        e0 += p * e[i]
+        e1 += q * e[i]
+        power[i] = q * t
+    out[0, 0], out[0, 1], out[1, 0], out[1, 1], out[2, 0], out[2, 1] = a0, a1, b0, b1, e0, e1
+
+
+@inner(cache=True)
+def _multiply_out(e, a, b, degree, f_u, f_v, g_u, g_v):
+    """From sums over t^m w^n times E, e[m, n], to those times b_v E, -b_u E, -a_v E and a_u E."""
+    top = len(degree)
+    for m in range(top + 1):
+        for n in range(top + 1):
+            f_u[m, n], f_v[m, n], g_u[m, n], g_v[m, n] = 0.0, 0.0, 0.0, 0.0
+            for i in range(top + 1):
+                for k in range(top):
+                    f_u[m, n] += (k + 1) * b[i, k + 1] * e[m + i, n + k]
+                    f_v[m, n] -= (k + 1) * b[k + 1, i] * e[m + k, n + i]
+                    g_u[m, n] -= (k + 1) * a[i, k + 1] * e[m + i, n + k]
+                    g_v[m, n] += (k + 1) * a[k + 1, i] * e[m + k, n + i]
+
+
+@inner(cache=True)
+def _shift_sums(sums, h, k, degree):
+    """From sums over t^m w^n to sums over (t + h)^m (w + k)^n, in place."""
+    top = len(degree)
+    for i in range(1, top + 1):
+        for m in range(top, i - 1, -1):
+            for n in range(top + 1):
+                sums[m, n] += h * sums[m - 1, n]
+    for i in range(1, top + 1):
+        for n in range(top, i - 1, -1):
+            for m in range(top + 1):
+                sums[m, n] += k * sums[m, n - 1]
+
+
+@inner(cache=True)
+def _add_sums(basis_powers, along, first, second, out):
+    """Add to out the sums over B along + B_u first + B_v second for the monomials B = u^m v^n of f (or of g)."""
+    for k in range(basis_powers.shape[0]):
+        m, n = basis_powers[k, 0], basis_powers[k, 1]
+        out[k] += along[m, n]
+        if m > 0:
+            out[k] += m * first[m - 1, n]
+        if n > 0:
+            out[k] += n * second[m, n - 1]
+
+
+@inner(cache=True, fastmath=FAST, error_model="numpy")
+def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples, sums, work):
+    """Add to out[k] the sum over a source's pixels of weight times row k of the basis, see `basis_row`.
+
+    About the source's peak a_u, a_v, b_u and b_v are polynomials in t and w. So the sums follow, however many monomials there
+    are, from those over t^m w^n times A = weight P_a |D|, B = weight P_b |D| and E = weight s P: `sums`, which holds beside them
+    what `_multiply_out` makes of the last.
+    """
+    top, rows = len(o.degree), range(fp.first[s], fp.first[s + 1])
+    n_f, n_g = basis.f.shape[0], basis.g.shape[0]
+    order = 2.0 if template == 0 else 3.0
+    widens = basis.row.size > 0 and basis.row[-1] == n_f + n_g + 1
+    a, b, d, h, k = maps.a[s], maps.b[s], maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
+    ra, rb, rav, rbv, rd, moments = work[0], work[1], work[2], work[3], work[4], work[5:8]
+    begin, ramp, offsets = fp.start[fp.first[s]], o.ramp, o.offsets
+    sums[:] = 0.0
+    flux = 0.0
+    for r in rows:
+        n = fp.size[r]
+        own = weight[fp.start[r] - begin : fp.start[r] - begin + n]
+        e, size, signed = samples[0, :n], samples[1, :n], samples[2, :n]
+        along_a, along_b, power = samples[3, :n], samples[4, :n], samples[5, :n]
+        for q in range(offsets.size):
+            w = (fp.row[r] - 0.5 * (o.ny - 1)) * o.step + offsets[q] - k
+            map_on_row(a, b, w, ra, rb, rav, rbv, o.degree)
+            polynomial_on_row(d, w, 1.0, rd, o.d_degree)
+            for p in range(offsets.size):
+                t = (fp.low[r] - 0.5 * (o.nx - 1)) * o.step + offsets[p] - h
+                norm = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
+                _samples_row(
+                    o.psf, sigma, norm, template, ramp, t, ra, rb, rd, o.degree, o.d_degree, e, size, signed, along_a, along_b
+                )
+                flux += _weigh_row(own, size, along_a, along_b, signed)
+                power[:] = 1.0
+                for m in range(0, 2 * top, 2):
+                    _two_moments(power, ramp, t, along_a, along_b, signed, moments[:, m:])
+                factor = 1.0
+                for i in range(2 * top):
+                    for m in range(2 * top):
+                        sums[0, m, i] += factor * moments[0, m]
+                        sums[1, m, i] += factor * moments[1, m]
+                        sums[2, m, i] += factor * moments[2, m]
+                    factor *= w
+    out[n_f + n_g] += flux
+    if widens:
+        wide = order * flux
+        for m in range(top + 1):
+            for i in range(top + 1):
+                wide += a[m, i] * sums[0, m, i] + b[m, i] * sums[1, m, i]
+        out[n_f + n_g + 1] -= wide / sigma
+    if len(o.d_degree) > 0:
+        _multiply_out(sums[2], a, b, o.degree, sums[3], sums[4], sums[5], sums[6])
+    for i in range(7):
+        _shift_sums(sums[i], h, k, o.degree)
+    _add_sums(basis.f, sums[0], sums[3], sums[4], out[:n_f])
+    _add_sums(basis.g, sums[1], sums[5], sums[6], out[n_f : n_f + n_g])
 
 
 @inner(cache=True, fastmath=FAST)

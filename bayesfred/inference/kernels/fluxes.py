@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner, take_turn
 from bayesfred.imaging.kernels.images import add_source, add_templates
 from bayesfred.imaging.kernels.maps import Footprints, Maps, footprints, locate, move, new_maps, new_work, row_starts
 from bayesfred.inference.kernels.clusters import (
@@ -37,7 +37,8 @@ from bayesfred.inference.kernels.clusters import (
     run_end,
     solve,
 )
-from bayesfred.inference.kernels.likelihood import LIMIT, background_row, clear, log_likelihood, mark_counted, mark_sources
+from bayesfred.inference.kernels.foretold import profile_foretold
+from bayesfred.inference.kernels.likelihood import LIMIT, background_row, clear, log_likelihood, mark_counted, mark_sources, room
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -74,12 +75,6 @@ class Drawn(NamedTuple):
 
 
 @inner(cache=True)
-def _room(w, first, size):
-    """A part of the workspace's heap, or new memory where it is too small."""
-    return w.heap[first : first + size] if first + size <= w.heap.size else np.empty(size)
-
-
-@inner(cache=True)
 def _patch(counts, w, fp, boxes, members, background, at):
     """A cluster's pixels, without sources; where its footprints' rows begin among them goes into `at`."""
     ny = w.span.shape[0]
@@ -97,7 +92,7 @@ def _patch(counts, w, fp, boxes, members, background, at):
     for j in range(low.size):
         start[j + 1] = start[j] + max(high[j] - low[j], 0)
     size = start[low.size]
-    values, level, image = (_room(w, 0, size), _room(w, w.image.size, size), _room(w, 2 * w.image.size, size))
+    values, level, image = (room(w, 0, size), room(w, w.image.size, size), room(w, 2 * w.image.size, size))
     patch = Patch(values, level, image, w.score[:size], w.weight[:size])
     patch.image[:] = 0.0
     for j in range(low.size):
@@ -204,7 +199,7 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
                 _make_templates(o, maps, fp, s, sigma, 1.0, stamps, work)
             else:
                 stamps[0, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] = 0.0
-                add_source(o, maps, fp, s, sigma, 1.0, fp.start, stamps[0], work)
+                add_source(o, maps, fp, s, fp.first[s], fp.first[s + 1], sigma, 1.0, fp.start, stamps[0], work, None, None)
             flux[s] = max(_first_flux(fp, s, stamps[0], patch, at), 0.01 * scale[s])
             stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= flux[s]
             draw_template(fp, s, stamps[0], flux[s], at, patch.image)
@@ -294,7 +289,7 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
         boxes = bounding_boxes(fp)
         clusters = find_clusters(boxes, o.ny, templates)
         factors = np.empty(clusters.begin[-1])
-        stamps = _room(w, 3 * w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
+        stamps = room(w, 3 * w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
         extra += _profile(
             o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, 0.5 * flux, fluxes, shifts, factors
         )
@@ -306,16 +301,30 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
         at = row_starts(fp, w.image.size // o.ny)
         for s in range(o.x.size):
             fluxes[s] = nuisances[0] * flux[s]
-            add_source(o, maps, fp, s, sigma, fluxes[s], at, w.image, work)
+            add_source(o, maps, fp, s, fp.first[s], fp.first[s + 1], sigma, fluxes[s], at, w.image, work, None, None)
     return Drawn(extra, maps, Fitted(fp, boxes, clusters, stamps, factors, fluxes, shifts))
 
 
 @nb.njit(cache=True, nogil=True)
-def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, first, step, out):
-    """Log-likelihoods of rows first, first + step, ... into `out`; rows where it is -inf already are left alone."""
-    for i in range(first, out.size, step):
+def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, foretold, turn, out):
+    """Log-likelihoods of rows into `out`; rows where it is -inf already are left alone.
+
+    `foretold` is None, or fluxes near their maximum. Each row is whose turn it is: threads that share `turn` share the rows, and
+    one that is held up takes fewer.
+    """
+    while True:
+        i = take_turn(turn)
+        if i >= out.size:
+            break
         if out[i] > -math.inf:
-            out[i] = draw(o, counts, w, theta[i], nuisances[i], background[i], flux, free).extra
-            if out[i] > -math.inf:
-                out[i] += log_likelihood(counts, w, background[i])
-            clear(w)
+            value = math.nan
+            if foretold is not None:
+                fluxes = foretold.fluxes[i].copy()
+                value = profile_foretold(o, counts, w, theta[i], nuisances[i], background[i], 0.5 * flux, fluxes, foretold)
+                clear(w)
+            if math.isnan(value):
+                value = draw(o, counts, w, theta[i], nuisances[i], background[i], flux, free).extra
+                if value > -math.inf:
+                    value += log_likelihood(counts, w, background[i])
+                clear(w)
+            out[i] = value

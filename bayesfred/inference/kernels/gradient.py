@@ -28,9 +28,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesfred.imaging.kernels.elementary import inner
-from bayesfred.imaging.kernels.jacobian import Basis, basis_row
+from bayesfred.imaging.kernels.jacobian import Basis, add_basis_sums, basis_row
 from bayesfred.imaging.kernels.maps import SEGMENT, new_work, row_starts
-from bayesfred.inference.kernels.clusters import add_block, cholesky, dot, draw_template, gram, one_cluster, solve, touch
+from bayesfred.inference.kernels.clusters import add_block, cholesky, draw_template, gram, one_cluster, solve, touch
 from bayesfred.inference.kernels.likelihood import LIMIT, POISSON, background_row, log_likelihood, next_run
 
 Floats = npt.NDArray[np.float64]
@@ -219,10 +219,10 @@ def _background_gradient(counts, w, background, image, out):
 def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_background):
     """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`.
 
-    Returns the derivative with respect to position_scatter, NaN where the likelihood is zero.
+    Returns the derivative with respect to position_scatter, NaN where the likelihood is zero, and z.
     """
     if not drawn.extra + log_likelihood(counts, w, background) > -math.inf:
-        return math.nan
+        return math.nan, np.empty((0, 0))
     maps, fp, fluxes, sigma = drawn.maps, drawn.fitted.footprints, drawn.fitted.fluxes, nuisances[3]
     size = drawn.fitted.stamps.shape[0]
     curve = np.empty(w.image.size)
@@ -233,24 +233,24 @@ def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_b
         z, mixed, image, slope = _laplace_adjoint(o, w, drawn, sigma, nuisances[4], curve)
     _background_gradient(counts, w, background, image, out_background)
     pitch = w.image.size // o.ny
-    rows = _new_rows(o, basis, pitch)
-    ones, c = np.ones(pitch), np.empty(pitch)
-    moments = np.empty(rows.out.shape[0])
+    most, reach = 0, 2 * len(o.degree) + 1
+    for s in range(o.x.size):
+        most = max(most, fp.start[fp.first[s + 1]] - fp.start[fp.first[s]])
+    samples, work, sums = np.empty((6, pitch)), np.empty((8, reach)), np.empty((7, reach, reach))
+    c, moments = np.empty(most), np.empty(basis.f.shape[0] + basis.g.shape[0] + 2)
     for s in range(o.x.size):
         moments[:] = 0.0
-        for p in range(fp.first[s], fp.first[s + 1]):
-            j, low, n = fp.row[p], fp.low[p], fp.size[p]
-            at = j * pitch + low
-            for t in range(size):
+        begin = fp.start[fp.first[s]]
+        for t in range(size):
+            for p in range(fp.first[s], fp.first[s + 1]):
+                q, n, at = fp.start[p], fp.size[p], fp.row[p] * pitch + fp.low[p]
                 for k in range(n):
-                    c[k] = fluxes[s] * image[at + k] if t == 0 else 0.0
+                    c[q - begin + k] = fluxes[s] * image[at + k] if t == 0 else 0.0
                 if free is not None:
-                    q, amplitude = fp.start[p], 1.0 if t == 0 else fluxes[s]
+                    amplitude = 1.0 if t == 0 else fluxes[s]
                     for k in range(n):
-                        c[k] += amplitude * (z[s, t] * w.score[at + k] - w.weight[at + k] * mixed[t, q + k])
-                basis_row(o, maps, basis, s, j, low, n, sigma, t, rows.out, rows.samples, rows.powers, rows.work)
-                for k in range(moments.size):
-                    moments[k] += dot(rows.out[k, :n], c[:n], ones[:n])
+                        c[q - begin + k] += amplitude * (z[s, t] * w.score[at + k] - w.weight[at + k] * mixed[t, q + k])
+            add_basis_sums(o, maps, fp, basis, s, sigma, t, c, moments, samples, sums, work)
         for k in range(basis.row.size):
             out[k] += basis.lever[s, k] * moments[basis.row[k]]
-    return slope
+    return slope, z

@@ -71,6 +71,12 @@ def new_workspace(o, nuisances, free):
 
 
 @inner(cache=True)
+def room(w, first, size):
+    """A part of the workspace's heap, or new memory where it is too small."""
+    return w.heap[first : first + size] if first + size <= w.heap.size else np.empty(size)
+
+
+@inner(cache=True)
 def mark_sources(fp, w):
     """Mark the segments that the sources' rows of pixels lie in."""
     flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
