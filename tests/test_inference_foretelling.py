@@ -62,8 +62,8 @@ def test_near_the_maximum_log_prob_is_the_same(case: str) -> None:
     for sd in (0.1, 1.0, 3.0):
         searched, foretold = posterior.log_prob(draws(best, sd)), near.log_prob(draws(best, sd))
         assert foretold == pytest.approx(searched, rel=0, abs=AGREE)
-        if sd == 1.0:  # other digits: these are not the searched ones once more
-            assert np.mean(foretold != searched) > 0.9
+        if sd == 1.0:  # other digits: most are not the searched ones once more
+            assert np.mean(foretold != searched) > 0.5
 
 
 @pytest.mark.parametrize("case", ["touching", "faint"])
