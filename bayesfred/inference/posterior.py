@@ -357,7 +357,7 @@ class Posterior:
         """The same posterior, with a `log_prob` that is several times faster around `params` where fluxes are free.
 
         It foretells the most likely fluxes from those at `params`. Where that fails it looks for them as usual; values differ by
-        rounding and at most 5e-5, by less than 1e-6 within a few standard deviations.
+        rounding and at most 5e-5, by some 1e-6 within a few standard deviations.
 
         Parameters
         ----------
@@ -368,6 +368,23 @@ class Posterior:
         Returns
         -------
         Posterior
+
+        Raises
+        ------
+        InputError
+            If there are more or fewer parameters than the posterior has.
+
+        Examples
+        --------
+        >>> import bayesfred as bf
+        >>> model = bf.ForwardModel(
+        ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
+        ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
+        >>> posterior = bf.Posterior(model, bf.simulate(model, [1e-4], 2.0, seed=1), nuisances=bf.Nuisances("free"))
+        >>> best = bf.find_map(posterior)
+        >>> near = posterior.near(best.params, best.covariance)
+        >>> bool(abs(near.log_prob(best.params) - posterior.log_prob(best.params)) < 1e-6)
+        True
         """
         if self.nuisances.profiled != 1:
             return self
