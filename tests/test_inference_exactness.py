@@ -41,7 +41,7 @@ SHORT, LONG = 0.05, 0.01  # Monte Carlo errors
 PRECISION = [SHORT, pytest.param(LONG, marks=pytest.mark.statistics)]
 WALKERS = 512
 ENSEMBLES = 4
-MOST_STEPS = 20_000
+MOST_STEPS = 40_000
 
 
 @pytest.fixture(autouse=True)
