@@ -14,8 +14,7 @@ from bayesfred.inference import priors
 from bayesfred.inference.ascent import climb
 from bayesfred.inference.goodness import goodness
 from bayesfred.inference.posterior import Posterior
-from bayesfred.inference.start import STEPS, Start, find_start, other_starts
-from bayesfred.inference.unexplained import settled
+from bayesfred.inference.start import Start, find_start, other_starts
 
 Floats = npt.NDArray[np.float64]
 
@@ -127,8 +126,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     posterior : Posterior
     start : array_like, shape (d,), optional
         Where to begin; by default what the counts alone say: peaks matched to the catalogue, and other starts where no
-        maximum is found from there, see `start.py`. On the way from either, bright spots that are in no catalogue and
-        sources that are missing from the frame are left out, see `unexplained.py`.
+        maximum is found from there, see `start.py`.
 
     Returns
     -------
@@ -164,8 +162,6 @@ def _find_map(posterior: Posterior, start: Sequence[float] | Floats | None) -> M
         how = _how(posterior, begun)
     else:
         origin, how = np.array(start, dtype=np.float64), ""
-        if np.isfinite(posterior.log_prob(origin)):
-            origin = settled(posterior, origin, STEPS)
     if not np.isfinite(posterior.log_prob(origin)):
         raise InputError("start: the posterior has no density there, expected parameters within the prior whose map does not fold")
     fisher = posterior.fisher(origin)
