@@ -19,6 +19,7 @@ from bayesfred.inference.kernels.foretold import ENOUGH
 from bayesfred.inference.noise import PoissonNoise
 from bayesfred.inference.posterior import Nuisances, Posterior
 from bayesfred.inference.sampling import sample
+from bayesfred.inference.verification import verify
 
 Floats = NDArray[np.float64]
 
@@ -116,3 +117,12 @@ def test_a_chain_of_free_fluxes_holds_the_log_prob_of_its_draws(tmp_path: Path) 
     run("parts.h5", 3)
     parts = run("parts.h5", 6, resume=True)
     assert np.array_equal(parts.chain, whole.chain) and np.array_equal(parts.log_prob, whole.log_prob)
+    assert all(check.holds for check in verify(tmp_path / "whole.h5"))
+
+
+def test_a_chain_that_went_far_verifies(tmp_path: Path) -> None:
+    posterior, _, best = solved("faint")
+    wide = replace(best, covariance=25.0 * best.covariance)
+    path = tmp_path / "wide.h5"
+    sample(posterior, wide, path=path, seed=4, walkers=8, steps=6, progress=False)
+    assert {check.what: check.holds for check in verify(path)}["log-probability"]

@@ -57,12 +57,13 @@ def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
     """
     chain = open_chain(path)
     posterior = chain.posterior()
+    near = posterior.near(chain.estimate.params, chain.estimate.covariance)  # as in the run
     return [
         Check("file", f"SHA-256 {stated_digest(path)}", True),  # it has been opened
         _posterior(path, posterior),
-        _log_prob(chain, posterior, every_draw),
+        _log_prob(chain, near, every_draw),
         *_maximum(chain, posterior),
-        *_steps(chain, posterior.near(chain.estimate.params, chain.estimate.covariance)),
+        *_steps(chain, near),
     ]
 
 
