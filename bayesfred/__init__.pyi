@@ -11,7 +11,7 @@ from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
 from .imaging.scene import SourceCatalog
 from .inference.chainfile import Chain, open_chain
-from .inference.estimate import MapEstimate, find_map
+from .inference.estimate import MapEstimate, find_map, sigma_clip
 from .inference.moves import LaplaceMove
 from .inference.noise import BackgroundNoise, PoissonNoise, simulate
 from .inference.posterior import Nuisances, Posterior
@@ -48,5 +48,6 @@ __all__ = [
     "runs",
     "sample",
     "sampling_matrix",
+    "sigma_clip",
     "simulate",
 ]

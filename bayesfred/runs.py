@@ -25,8 +25,9 @@ from bayesfred.analysis.study import VARIABLES, NoiseStudy, noise_study
 from bayesfred.errors import InputError, printable
 from bayesfred.inference import verification
 from bayesfred.inference.chainfile import Chain, open_chain
+from bayesfred.inference.estimate import MapEstimate, sigma_clip
 from bayesfred.inference.posterior import Posterior
-from bayesfred.inference.sampling import sample, versions
+from bayesfred.inference.sampling import sample, searching, versions
 from bayesfred.reporting import html, plots
 
 Floats = npt.NDArray[np.float64]
@@ -149,15 +150,15 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     path = settings.resolve(run.frame.path, run_file, must_exist=True)
     if os.path.exists(output) and output.samefile(path):
         raise InputError(f"{run_file}: output.path: got the frame's file, expected another: the chain would replace the frame")
-    posterior, notes = _framed(run, run_file)
+    posterior, estimate, notes = _framed(run, run_file)
     if run.output.path is None and not output.parent.is_dir():
         with _writing(output):
             output.parent.mkdir()
-    return _fit(posterior, output, run, run_file, notes, resume=resume, overwrite=overwrite)
+    return _fit(posterior, output, run, run_file, notes, estimate=estimate, resume=resume, overwrite=overwrite)
 
 
-def _framed(run: settings.RunSettings, run_file: Path) -> tuple[Posterior, list[str]]:
-    """The posterior of the frame that a run file names, and what there is to say about the frame."""
+def _framed(run: settings.RunSettings, run_file: Path) -> tuple[Posterior, MapEstimate | None, list[str]]:
+    """The posterior of the frame that a run file names, its maximum where clipping has found it, and what there is to say."""
     f = run.frame
     path = settings.resolve(f.path, run_file, must_exist=True)
     frame = files.read_frame(path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name)
@@ -169,7 +170,14 @@ def _framed(run: settings.RunSettings, run_file: Path) -> tuple[Posterior, list[
     with _naming(run_file):
         model = assembly.forward_model(run, (ny, nx), sources, psf)
         posterior = assembly.posterior_given(run, model, frame.counts, frame.valid)
-    return posterior, [frame.description, census]
+        if not f.sigma_clip:
+            return posterior, None, [frame.description, census]
+        with searching():
+            clipped, estimate = sigma_clip(posterior)
+    lost, pixels = len(sources) - len(clipped.model.sources), int(np.sum(posterior.mask & ~clipped.mask))
+    clipping = f"sigma clipping: {lost} of {len(sources)} sources and {pixels} of {posterior.mask.sum()} pixels left out"
+    print(clipping)
+    return clipped, estimate, [frame.description, census, clipping]
 
 
 def study(
@@ -399,6 +407,7 @@ def _fit(
     run_file: Path,
     notes: Sequence[str],
     *,
+    estimate: MapEstimate | None = None,
     truth: Floats | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -421,7 +430,7 @@ def _fit(
             raise InputError(f"{path}: exists, expected a new file: {remedy}")
     with _writing(output), _naming(run_file):
         chain = sample(
-            posterior, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
+            posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles, walkers=s.walkers,
             target_ess=s.target_ess, steps=s.steps, resume=resume, overwrite=overwrite,
         )  # fmt: skip
     print(f"maximum: {chain.estimate.message}")

@@ -61,6 +61,8 @@ class FrameSettings(_Section):
         Pixels at or above this level are masked.
     name : str, optional
         FITS extension or HDF5 dataset.
+    sigma_clip : bool
+        Whether spots of no source, and sources without a spot, are left out: `bayesfred.sigma_clip`.
     """
 
     path: _Name
@@ -68,6 +70,7 @@ class FrameSettings(_Section):
     pedestal: _Float = 0.0
     saturation: _Float | None = None
     name: _Name | None = None
+    sigma_clip: bool = False
 
 
 class CatalogueSettings(_Section):

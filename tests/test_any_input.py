@@ -69,7 +69,12 @@ PRIOR = st.fixed_dictionaries(
 )
 PLACES = ["chains/run.h5", "link/run.h5", "link.h5", "../precious/new.h5", "precious.h5", "{root}/x.h5", "./a b.h5", "<b>'.h5"]
 SOUND: dict[str, dict[str, SearchStrategy[Any]]] = {
-    "frame": {"gain": st.floats(0.1, 100), "pedestal": st.integers(-100, 0), "saturation": st.floats(1, 1e5)},
+    "frame": {
+        "gain": st.floats(0.1, 100),
+        "pedestal": st.integers(-100, 0),
+        "saturation": st.floats(1, 1e5),
+        "sigma_clip": st.booleans(),
+    },
     "catalogue": {"flux": st.sampled_from(["x", "flux"]), "x": st.just("y")},
     "detector": {"pixel": st.sampled_from(["impulse", "box"]), "binning": st.integers(1, 4)},
     "psf": {"sigma": st.floats(0.5, 5) | st.floats(1e-3, 100)},

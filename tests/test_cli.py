@@ -666,6 +666,30 @@ def test_saturated_and_lost_pixels_are_counted_on_screen_and_page(folder: Path) 
     np.testing.assert_array_equal(mask, np.isfinite(counts) & (counts < 5000))
 
 
+def test_what_frame_and_catalogue_do_not_share_is_clipped_if_asked_for(folder: Path) -> None:
+    """The catalogue lacks a star of the frame and has one, of 5,000 photons as the others, that the frame lacks."""
+    lines = (folder / "stars.csv").read_text().splitlines()
+    (folder / "stars.csv").write_text("\n".join([*lines[:3], *lines[4:], "24,8,5000", ""]))
+    output = invoke(folder, "fit", "run.toml")
+    assert "exceed the noise" in output.stdout and "(sigma_clip leaves them out)" in output.stdout
+    sections(frame='path = "frame.fits"\nsigma_clip = true')(folder)
+    output = invoke(folder, "fit", "run.toml", "--overwrite")
+    assert output.code == 0
+    line = next(line for line in output.stdout.splitlines() if line.startswith("sigma clipping"))
+    assert re.fullmatch(r"sigma clipping: 1 of 9 sources and \d+ of 4500 pixels left out", line)
+    assert line in page_text(folder / "run.html")
+    chain = open_chain(folder / "run.h5")
+    posterior = chain.posterior()
+    assert len(posterior.model.sources) == 8 and 24.0 not in posterior.model.sources.x
+    x, y = (float(value) for value in lines[3].split(",")[:2])
+    assert not posterior.mask[round(y + 29.5), round(x + 37.0)]
+    assert max(abs(z) for z in z_scores(chain, TRUTH | {"background": BACKGROUND}).values()) < 4.0
+    assert invoke(folder, "verify", "run.h5").code == 0
+    draws = chain.draws()
+    assert invoke(folder, "fit", "run.toml", "--resume").code == 0  # the same is left out again
+    np.testing.assert_array_equal(open_chain(folder / "run.h5").draws()[: len(draws)], draws)
+
+
 def test_sources_at_the_edge_are_kept_and_those_outside_left_out(folder: Path) -> None:
     """The frame reaches to 37.5 and 30. The first added source is inside, the next outside within reach, two beyond."""
     text = (folder / "stars.csv").read_text()

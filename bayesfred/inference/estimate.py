@@ -1,6 +1,6 @@
 """The posterior's maximum and its Laplace approximation: `start.py` says where to begin, `ascent.py` climbs, here it is judged."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.inference import priors
-from bayesfred.inference.ascent import climb
+from bayesfred.inference.ascent import Ascent, climb
+from bayesfred.inference.clipping import Clipped, settle, whole
 from bayesfred.inference.goodness import goodness
 from bayesfred.inference.posterior import Posterior
 from bayesfred.inference.start import Start, find_start, other_starts
@@ -151,47 +152,115 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     >>> find_map(posterior).converged
     True
     """
+    return _search(whole, posterior, start)[1]
+
+
+def sigma_clip(posterior: Posterior, start: Sequence[float] | Floats | None = None) -> tuple[Posterior, MapEstimate]:
+    """Leave out what frame and catalogue do not have in common, and maximise the posterior of the rest.
+
+    Sources that lack their light are taken off the catalogue; spots of no source, and whatever else stands out of the noise by
+    5 standard deviations at the maximum, are masked. Where nothing does, the posterior is the one that was given.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    start : array_like, shape (d,), optional
+        Where to begin; as in `find_map`.
+
+    Returns
+    -------
+    posterior : Posterior
+        The one to sample, of the sources and the pixels that remain.
+    estimate : MapEstimate
+        Its maximum; the message says how many sources and spots are left out.
+
+    Raises
+    ------
+    InputError
+        As `find_map` does.
+
+    Notes
+    -----
+    What is left out is chosen by the counts, and taken for certain. Of a frame with nothing but noise 5 standard deviations leave
+    out one place in millions. Where more than three in five sources would have to go, the model is taken to be wrong, not the
+    catalogue: only what exceeds a share of the light of the stars nearby is left out then, or nothing.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(2.0),
+    ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
+    >>> counts = bf.simulate(model, [1e-4], 2.0, seed=1)
+    >>> counts[40:43, 20:23] += 500.0  # in no catalogue
+    >>> posterior = bf.Posterior(model, counts)
+    >>> find_map(posterior).converged
+    False
+    >>> clipped, estimate = sigma_clip(posterior)
+    >>> estimate.converged, bool(clipped.mask[41, 21]), len(clipped.model.sources)
+    (True, False, 9)
+    """
+    return _search(settle, posterior, start)
+
+
+def _search(
+    clipping: Callable[[Posterior, Floats], tuple[Clipped, Floats, int]],
+    posterior: Posterior,
+    start: Sequence[float] | Floats | None,
+) -> tuple[Posterior, MapEstimate]:
+    """The posterior that clipping leaves, and its maximum."""
     with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin, and take the cores from what is at work
-        return _find_map(posterior, start)
-
-
-def _find_map(posterior: Posterior, start: Sequence[float] | Floats | None) -> MapEstimate:
-    if start is None:
-        begun = find_start(posterior)
-        origin = begun.params
-        how = _how(posterior, begun)
-    else:
-        origin, how = np.array(start, dtype=np.float64), ""
-    if not np.isfinite(posterior.log_prob(origin)):
-        raise InputError("start: the posterior has no density there, expected parameters within the prior whose map does not fold")
-    fisher = posterior.fisher(origin)
-    weak = undetermined(posterior, origin, fisher)
-    if weak:
-        raise InputError(
-            f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than their "
-            "noise: leave out terms, add sources, or give these parameters a narrower prior"
-        )
-    top = climb(posterior, origin, fisher=fisher)
-    evaluations = top.evaluations
-    if start is None and top.distance >= CLOSENESS:
-        for other in other_starts(posterior, begun):
-            if not np.isfinite(posterior.log_prob(other.params)):
-                continue
-            again = climb(posterior, other.params)
-            evaluations += again.evaluations
+        top, evaluations = None, 0
+        for begun in _starts(posterior, start):
+            if not np.isfinite(posterior.log_prob(begun.params)):
+                if top is not None:
+                    continue
+                raise InputError(
+                    "start: the posterior has no density there, expected parameters within the prior whose map does not fold"
+                )
+            clipped, origin, spent = clipping(posterior, begun.params)
+            fisher = clipped.posterior.fisher(origin)
+            weak = undetermined(clipped.posterior, origin, fisher)
+            if weak:
+                raise InputError(
+                    f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than "
+                    "their noise: leave out terms, add sources, or give these parameters a narrower prior"
+                )
+            again = climb(clipped.posterior, origin, fisher=fisher)
+            evaluations += spent + again.evaluations
+            if top is None or again.distance < CLOSENESS:
+                top, found, how = again, clipped, _how(posterior, begun)
             if again.distance < CLOSENESS:
-                top, how = again, _how(posterior, other)
                 break
+        assert top is not None, "a first start"
+        return found.posterior, _judged(found, top, evaluations, how)
+
+
+def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Iterator[Start]:
+    """Where to begin, and where to begin anew while no maximum is found."""
+    if start is not None:
+        yield Start(np.array(start, dtype=np.float64), "", 0)
+        return
+    begun = find_start(posterior)
+    yield begun
+    yield from other_starts(posterior, begun)
+
+
+def _judged(found: Clipped, top: Ascent, evaluations: int, how: str) -> MapEstimate:
+    """Whether it is a maximum, and whether the model fits there."""
+    posterior = found.posterior
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
     message = f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} evaluations{how}"
+    if found.missing.any() or found.spots.any():
+        message += f", {found.missing.sum()} sources and {found.spots.sum()} spots left out"
     bounds = zip(posterior.parameter_names, top.params, *posterior.support, strict=True)
     if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
         message += f", {', '.join(at_bound)} at a bound of the prior"
     if not at_maximum:
         message = f"not found, {message}: begin elsewhere (start), fit fewer terms, or narrow the priors"
     elif not abs(excess) <= CONSISTENT:
-        message = f"found, {message}; {_advice(excess)}"
+        message = f"found, {message}; {_advice(excess, found)}"
     else:
         message = f"found, {message}; residuals as the noise makes them"
     converged = at_maximum and abs(excess) <= CONSISTENT
@@ -199,7 +268,7 @@ def _find_map(posterior: Posterior, start: Sequence[float] | Floats | None) -> M
 
 
 def _how(posterior: Posterior, begun: Start) -> str:
-    return f" from {begun.path}, {begun.matched} of {len(posterior.model.sources)} sources matched"
+    return f" from {begun.path}, {begun.matched} of {len(posterior.model.sources)} sources matched" if begun.path else ""
 
 
 def _excess(posterior: Posterior, params: Floats) -> float:
@@ -208,12 +277,14 @@ def _excess(posterior: Posterior, params: Floats) -> float:
     return float((fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"])
 
 
-def _advice(excess: float) -> str:
+def _advice(excess: float, found: Clipped) -> str:
     """What to do about residuals that are not those of the noise."""
     if excess > 0:
+        left = found.missing.any() or found.spots.any()
+        spots = "" if left else ", or sources that the catalogue lacks or the frame misses (sigma_clip leaves them out)"
         return (
             f"but the residuals exceed the noise (deviance {excess:.0f} standard deviations above its expectation): look at "
-            "them for sources that the catalogue lacks or the frame misses, a PSF or fluxes that are not right, or terms left out"
+            f"them for a PSF or fluxes that are not right, terms left out{spots}"
         )
     return (
         f"but the residuals are less than the noise (deviance {-excess:.0f} standard deviations below its expectation): check "

@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.status import Status
 from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
@@ -116,17 +117,17 @@ def sample(
             chain = open_chain(path)
             run = _Run.resumed(posterior.near(chain.estimate.params, chain.estimate.covariance), chain, random_states(path))
         else:
-            estimate = estimate or _find_map(posterior, progress)
+            if estimate is None:
+                with searching() if progress else nullcontext():
+                    estimate = find_map(posterior)
             posterior = posterior.near(estimate.params, estimate.covariance)
             run = _Run(posterior, estimate, path, seed, begin(posterior, estimate, seed, ensembles, walkers))
         return run.until(target_ess, steps, progress)
 
 
-def _find_map(posterior: Posterior, progress: bool) -> MapEstimate:
-    if not progress:
-        return find_map(posterior)
-    with Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)"):
-        return find_map(posterior)
+def searching() -> Status:
+    """Says on the screen, within its `with` block, that the maximum is being searched for."""
+    return Console(stderr=True).status("searching for the maximum (the first run on a machine compiles: half a minute)")
 
 
 def _check_numbers(ensembles: int, walkers: int, target_ess: float, steps: int | None) -> None:

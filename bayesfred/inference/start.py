@@ -12,7 +12,7 @@ it may be. The prior keeps the fit from running away; weights that fall with the
 Where stars overlap or are too faint to be matched one by one, the likelihood does the same: it is climbed on a disk around
 the axis that grows as far as the last climb foretells stars within the PSF's width, and with a wider PSF, on a blurred frame,
 where even the innermost are foretold less surely. From every disk only the places of its stars are taken over, under the prior.
-Climbs on the way leave out what the catalogue does not explain, see `unexplained.py`.
+Climbs on the way leave out what frame and catalogue do not have in common, see `clipping.py`.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ from bayesfred.imaging.kernels.maps import image_positions
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.ascent import climb
+from bayesfred.inference.clipping import COARSE, STEPS, clip
 from bayesfred.inference.posterior import Posterior
-from bayesfred.inference.unexplained import explained, settled
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -46,7 +46,6 @@ LOST = 0.3  # a match is not trusted if more of the stars that stand alone have 
 LOST_AT_MOST = 0.45  # ... nor a climb from it
 REACH = 0.7  # the likelihood finds a star that is predicted to so many PSF widths
 FEWEST = 6  # stars of the innermost disk
-STEPS = 8  # of a climb on the way
 PLAIN, DISK = "the prior's medians", "a growing disk"
 
 
@@ -106,10 +105,9 @@ def find_start(posterior: Posterior) -> Start:
     if not np.isfinite(posterior.log_prob(params)):
         return Start(plain, PLAIN, matched)
     if trusted:
-        return Start(settled(posterior, params, STEPS), "matched peaks", matched)
+        return Start(params, "matched peaks", matched)
     if _lost(field, peaks, z) < LOST_AT_MOST:
-        params = climb(explained(posterior, params), params, steps=STEPS).params
-        params = settled(posterior, params, STEPS)
+        params = climb(clip(posterior, params, COARSE).posterior, params, steps=STEPS).params
         if _lost(field, peaks, params[field.columns]) < LOST_AT_MOST:
             return Start(params, "matched peaks and a first climb", matched)
     grown = _unfolded(posterior, outward(field, plain), plain)
@@ -372,7 +370,7 @@ def outward(field: Field, params: Floats) -> Floats:
         begin = _unfolded(part, begin, part.start())
         if not np.isfinite(part.log_prob(begin)):
             break
-        top = climb(explained(part, begin), begin, steps=STEPS)
+        top = climb(clip(part, begin, COARSE).posterior, begin, steps=STEPS)
         if not np.isfinite(top.distance):
             break
         params, columns = top.params[index], [index[k] for k in field.columns]
