@@ -265,6 +265,14 @@ def test_stars_too_faint_for_peaks_are_found_on_a_growing_disk() -> None:
     assert climb(posterior, posterior.start()).log_prob < best.log_prob - 100.0
 
 
+def test_a_disk_grows_where_positions_scatter_too() -> None:
+    model = grid(7, distortion=PolynomialDistortion([(1, 0, 2, 0)], [(0, 1, 0, 2)]))
+    posterior = Posterior(model, simulate(model, [1e-5, 2e-5], 2.0, seed=1), nuisances=Nuisances("free", position_scatter=True))
+    params = outward(Field(posterior), posterior.start())
+    np.testing.assert_allclose(params[:2], [1e-5, 2e-5], atol=1e-6)
+    assert params.size == posterior.n_parameters == 4
+
+
 def test_overlapping_stars_are_found() -> None:
     sources = SourceCatalog.grid(9, 12.0, 5e3)
     model = ForwardModel(Detector((133, 133)), sources, GaussianPSF(5.0), PINHOLE)

@@ -6,6 +6,8 @@ its light is taken off the catalogue. What else stands out of the noise is maske
 
 What stands out is looked for in the frame less its expectation, filtered with minus the Laplacian of the PSF, which no smooth
 background passes. A spot of flux F and width s has the height F / 4 pi s^4 in it, and a pixel variance B becomes B / 2 pi s^6.
+Around a spot there is a dark ring, which looks as if its neighbours lacked light. So the highest peaks are explained first, each as
+a missing source or as a spot of its own, and the others looked for in what these leave.
 
 Parameters that are wrong make every bright star stand out. So what may still be their fault is tolerated: a share of the light
 of the stars nearby, the smallest one with which most stars remain. Fitted to these the parameters get better and the share
@@ -32,9 +34,10 @@ Flags = npt.NDArray[np.bool_]
 SIGNIFICANCE = 5.0  # of what is left out, in standard deviations; so it has this number's square of counts at least
 TOLERANCES = (0.0, 0.03, 0.1, 0.3, 1.0)  # shares of the stars' light nearby
 COARSE = TOLERANCES[-2:]  # for parameters that are foretold, not fitted
-LACK = 0.5  # a missing source lacks more than this share of its light
-FAINT = 0.3  # a pixel is masked where a spot has more than this share of the noise's standard deviation
-MOST = 0.6  # of the stars are left out; where there would be more, the parameters are wrong, not the catalogue
+ALIKE = 2.0  # a missing source is as bright as the dark spot that it leaves, within this factor
+FAINT = 0.3  # a pixel is masked where spots have more than this share of the noise's standard deviation
+MOST = 0.7  # of the stars are left out; where there would be more, the parameters are wrong, not the catalogue
+LOOKS = 10  # for peaks, those that others hid among them
 ROUNDS = 8
 STEPS = 8  # of a climb on the way
 
@@ -48,18 +51,22 @@ class Clipped(NamedTuple):
         Of the sources and pixels that remain; the very one that was given where nothing is left out.
     missing : ndarray of bool, shape (n,)
         Which sources of the given posterior are not in this one.
-    spots : ndarray of bool, shape (ny, nx)
-        The peaks of what is masked, bright or dark.
+    masked : int
+        Pixels of the given posterior that are not in this one.
+    lost : ndarray of bool, shape (n,)
+        The missing sources, and those that the mask hides.
     """
 
     posterior: Posterior
     missing: Flags
-    spots: Flags
+    masked: int
+    lost: Flags
 
 
 def whole(posterior: Posterior, params: Floats) -> tuple[Clipped, Floats, int]:
     """All of a posterior and the same parameters: what `settle` returns where nothing stands out, without a look."""
-    return Clipped(posterior, np.zeros(len(posterior.model.sources), bool), np.zeros(posterior.counts.shape, bool)), params, 0
+    none = np.zeros(len(posterior.model.sources), bool)
+    return Clipped(posterior, none, 0, none), params, 0
 
 
 def settle(posterior: Posterior, params: Floats) -> tuple[Clipped, Floats, int]:
@@ -67,9 +74,11 @@ def settle(posterior: Posterior, params: Floats) -> tuple[Clipped, Floats, int]:
     clipped, params, evaluations = whole(posterior, params)
     seen: set[bytes] = set()
     for _ in range(ROUNDS):
+        if not np.isfinite(posterior.log_prob(params)):  # folded where a source is missing
+            break
         found = clip(posterior, params)
-        key = found.missing.tobytes() + found.spots.tobytes()
-        if key in seen or not np.isfinite(found.posterior.log_prob(params)):
+        key = found.missing.tobytes() + found.lost.tobytes()
+        if key in seen:
             break
         seen.add(key)
         clipped, top = found, climb(found.posterior, params, steps=STEPS)
@@ -81,16 +90,12 @@ def clip(posterior: Posterior, params: Floats, tolerances: Sequence[float] = TOL
     """The posterior without what these parameters do not explain, with the least tolerance at which most stars remain."""
     look = _Look(posterior, params)
     for tolerance in tolerances:
-        missing, expected = look.missing(tolerance)
-        spots, mask = look.spots(expected, tolerance)
+        missing, mask = look.outliers(tolerance)
         lost = missing | ~mask[look.row, look.column]
-        if mask.any() and lost[look.inside].sum() <= MOST * look.inside.sum():
-            break
-    else:
-        missing[:], spots[:] = False, False
-    if not missing.any() and not spots.any():
-        return Clipped(posterior, missing, spots)
-    return Clipped(_part(posterior, missing, mask), missing, spots)
+        if mask.any() and not look.too_many(lost):
+            masked = int(np.sum(posterior.mask & ~mask))
+            return Clipped(_part(posterior, missing, mask if masked else posterior.mask), missing, masked, lost)
+    return whole(posterior, params)[0]
 
 
 class _Look:
@@ -104,48 +109,65 @@ class _Look:
         theta, offset = params[: model.distortion.n_terms].copy(), [known.get(name, 0.0) for name in ("offset_x", "offset_y")]
         u, v = image_positions(model.optics(), theta, *offset, model.psf.sigma).T / step
         ny, nx = model.detector.shape
-        row, column = (np.rint(at + 0.5 * (n - 1)).astype(int) for at, n in ((v, ny), (u, nx)))
-        inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
-        self.row, self.column = np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)
-        self.inside = inside & posterior.mask[self.row, self.column]
-        self.height = known.get("flux_scale", 1.0) * model.sources.flux / (4.0 * np.pi * s**4)
+        self.places = np.stack([v + 0.5 * (ny - 1), u + 0.5 * (nx - 1)], axis=1)
+        nearest = np.rint(self.places).astype(int)
+        self.row, self.column = np.clip(nearest, 0, [ny - 1, nx - 1]).T
+        self.inside = np.all(nearest == np.stack([self.row, self.column], axis=1), axis=1) & posterior.mask[self.row, self.column]
+        self.flux = known.get("flux_scale", 1.0) * model.sources.flux
+        self.height = 4.0 * np.pi * s**4  # of flux over height
         self.level = known["background"]
+        self.expected = posterior.expected_counts(params)
 
-    def _filtered(self, expected: Floats, tolerance: float) -> tuple[Floats, Floats]:
-        """What the frame has more than is expected, and how much is too much."""
+    def too_many(self, lost: Flags) -> bool:
+        return bool(lost[self.inside].sum() > MOST * self.inside.sum())
+
+    def outliers(self, tolerance: float) -> tuple[Flags, Flags]:
+        """Which sources are missing, shape (n,), and the pixels that the light of spots leaves, shape (ny, nx)."""
         p, s = self.posterior, self.width
-        excess, light = (-ndimage.gaussian_laplace(np.where(p.mask, image, 0.0), s) for image in (p.counts - expected, expected))
-        variance = np.where(p.mask, 1.0 / p.noise.fisher_weight(expected, self.level), 0.0)
-        noise = np.sqrt(ndimage.gaussian_filter(variance, s) / (2.0 * np.pi * s**6))
-        limit = SIGNIFICANCE * noise + SIGNIFICANCE**2 / (4.0 * np.pi * s**4)
-        return excess, limit + tolerance * ndimage.maximum_filter(light, 2 * int(np.ceil(3.0 * s)) + 1)
+        missing, expected, light = np.zeros(self.flux.size, bool), self.expected, np.zeros(p.counts.shape)
+        mask, near = p.mask, 2 * int(np.ceil(3.0 * s)) + 1
+        for _ in range(LOOKS):
+            variance = np.where(p.mask, 1.0 / p.noise.fisher_weight(expected + np.maximum(light, 0.0), self.level), 0.0)
+            limit = SIGNIFICANCE * np.sqrt(ndimage.gaussian_filter(variance, s) / (2.0 * np.pi * s**6))
+            limit += SIGNIFICANCE**2 / self.height
+            if tolerance:
+                limit += tolerance * ndimage.maximum_filter(self._filtered(expected), near)
+            excess = self._filtered(p.counts - expected - light)
+            height = np.abs(excess)
+            row, column = np.nonzero((height > limit) & (height == ndimage.maximum_filter(height, near)))
+            if not row.size:
+                break
+            flux = self.height * excess[row, column]
+            absent = self._absent(np.stack([row, column], axis=1), flux, missing)
+            missing[absent[absent >= 0]] = True
+            if missing.all():
+                break
+            if np.any(absent >= 0):
+                expected = _part(p, missing, p.mask).expected_counts(self.params)
+            spots = np.zeros_like(light)
+            spots[row, column] = np.where(absent < 0, flux, 0.0)
+            light += ndimage.gaussian_filter(spots, s, truncate=6.0)
+            spread = ndimage.maximum_filter(np.abs(light), 2 * int(np.ceil(0.25 * s)) + 1)  # between pixels, of another width
+            mask = p.mask & (spread <= FAINT * p.noise.fisher_weight(expected, self.level) ** -0.5)
+            if self.too_many(missing | ~mask[self.row, self.column]):
+                break
+        return missing, mask
 
-    def missing(self, tolerance: float) -> tuple[Flags, Floats]:
-        """Which sources lack their light, shape (n,), and what is expected without them, shape (ny, nx)."""
-        missing = np.zeros(self.height.size, bool)
-        while True:
-            expected = _part(self.posterior, missing, self.posterior.mask).expected_counts(self.params)
-            excess, limit = (image[self.row, self.column] for image in self._filtered(expected, tolerance))
-            more = np.flatnonzero(self.inside & ~missing & (-excess > np.maximum(limit, LACK * self.height)))
-            # where several overlap, the brightest may be all that is missing
-            places = spatial.cKDTree(np.stack([self.row, self.column], axis=1)[more])
-            pairs = places.query_pairs(2.0 * self.width, output_type="ndarray")
-            first, second = self.height[more][pairs].T
-            more = np.delete(more, np.where(first < second, *pairs.T))
-            if not more.size or missing.sum() + more.size == missing.size:
-                return missing, expected
-            missing[more] = True
+    def _absent(self, places: Ints, flux: Floats, missing: Flags) -> Ints:
+        """The source whose absence leaves a dark spot with this flux, shape (number of spots,); -1 where none does."""
+        absent = np.full(flux.size, -1)
+        there = np.flatnonzero(self.inside & ~missing)
+        if not there.size:
+            return absent
+        near = spatial.cKDTree(self.places[there]).query_ball_point(places, self.width)
+        for k in np.flatnonzero(flux < 0.0):
+            unlike = np.abs(np.log(self.flux[there[near[k]]] / -flux[k]))
+            if unlike.min(initial=np.inf) < np.log(ALIKE):
+                absent[k] = there[near[k][np.argmin(unlike)]]
+        return absent
 
-    def spots(self, expected: Floats, tolerance: float) -> tuple[Flags, Flags]:
-        """The peaks of what else stands out, and the pixels that its light leaves, both of shape (ny, nx)."""
-        s = self.width
-        excess, limit = self._filtered(expected, tolerance)
-        height = np.abs(excess)
-        spots = (height == ndimage.maximum_filter(height, 2 * int(np.ceil(s)) + 1)) & (height > limit)
-        light = ndimage.gaussian_filter(np.where(spots, 4.0 * np.pi * s**4 * height, 0.0), s, truncate=6.0)
-        light = ndimage.maximum_filter(light, 2 * int(np.ceil(0.25 * s)) + 1)  # of a peak between pixels, of another width
-        noise = self.posterior.noise.fisher_weight(expected, self.level) ** -0.5
-        return spots, self.posterior.mask & (light <= FAINT * noise)
+    def _filtered(self, image: Floats) -> Floats:
+        return np.asarray(-ndimage.gaussian_laplace(np.where(self.posterior.mask, image, 0.0), self.width))
 
 
 def _part(posterior: Posterior, missing: Flags, mask: Flags) -> Posterior:

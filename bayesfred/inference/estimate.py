@@ -158,8 +158,8 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
 def sigma_clip(posterior: Posterior, start: Sequence[float] | Floats | None = None) -> tuple[Posterior, MapEstimate]:
     """Leave out what frame and catalogue do not have in common, and maximise the posterior of the rest.
 
-    Sources that lack their light are taken off the catalogue; spots of no source, and whatever else stands out of the noise by
-    5 standard deviations at the maximum, are masked. Where nothing does, the posterior is the one that was given.
+    Sources that are missing from the frame are taken off the catalogue; spots of no source, and whatever else stands out of the
+    noise by 5 standard deviations at the maximum, are masked. Where nothing does, the posterior is the one that was given.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def sigma_clip(posterior: Posterior, start: Sequence[float] | Floats | None = No
     posterior : Posterior
         The one to sample, of the sources and the pixels that remain.
     estimate : MapEstimate
-        Its maximum; the message says how many sources and spots are left out.
+        Its maximum; the message says how many sources and pixels are left out.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def sigma_clip(posterior: Posterior, start: Sequence[float] | Floats | None = No
     Notes
     -----
     What is left out is chosen by the counts, and taken for certain. Of a frame with nothing but noise 5 standard deviations leave
-    out one place in millions. Where more than three in five sources would have to go, the model is taken to be wrong, not the
+    out one place in millions. Where more than seven in ten sources would have to go, the model is taken to be wrong, not the
     catalogue: only what exceeds a share of the light of the stars nearby is left out then, or nothing.
 
     Examples
@@ -218,15 +218,15 @@ def _search(
                 raise InputError(
                     "start: the posterior has no density there, expected parameters within the prior whose map does not fold"
                 )
-            clipped, origin, spent = clipping(posterior, begun.params)
-            fisher = clipped.posterior.fisher(origin)
-            weak = undetermined(clipped.posterior, origin, fisher)
+            fisher = posterior.fisher(begun.params)
+            weak = undetermined(posterior, begun.params, fisher)
             if weak:
                 raise InputError(
                     f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than "
                     "their noise: leave out terms, add sources, or give these parameters a narrower prior"
                 )
-            again = climb(clipped.posterior, origin, fisher=fisher)
+            clipped, origin, spent = clipping(posterior, begun.params)
+            again = climb(clipped.posterior, origin, fisher=fisher if origin is begun.params else None)
             evaluations += spent + again.evaluations
             if top is None or again.distance < CLOSENESS:
                 top, found, how = again, clipped, _how(posterior, begun)
@@ -252,8 +252,8 @@ def _judged(found: Clipped, top: Ascent, evaluations: int, how: str) -> MapEstim
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
     message = f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} evaluations{how}"
-    if found.missing.any() or found.spots.any():
-        message += f", {found.missing.sum()} sources and {found.spots.sum()} spots left out"
+    if found.lost.any() or found.masked:
+        message += f", {found.missing.sum()} sources and {found.masked} pixels left out"
     bounds = zip(posterior.parameter_names, top.params, *posterior.support, strict=True)
     if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
         message += f", {', '.join(at_bound)} at a bound of the prior"
@@ -280,8 +280,11 @@ def _excess(posterior: Posterior, params: Floats) -> float:
 def _advice(excess: float, found: Clipped) -> str:
     """What to do about residuals that are not those of the noise."""
     if excess > 0:
-        left = found.missing.any() or found.spots.any()
-        spots = "" if left else ", or sources that the catalogue lacks or the frame misses (sigma_clip leaves them out)"
+        spots = (
+            ""
+            if found.lost.any() or found.masked
+            else ", or sources that the catalogue lacks or the frame misses (sigma_clip leaves them out)"
+        )
         return (
             f"but the residuals exceed the noise (deviance {excess:.0f} standard deviations above its expectation): look at "
             f"them for a PSF or fluxes that are not right, terms left out{spots}"

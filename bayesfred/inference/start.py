@@ -108,6 +108,7 @@ def find_start(posterior: Posterior) -> Start:
         return Start(params, "matched peaks", matched)
     if _lost(field, peaks, z) < LOST_AT_MOST:
         params = climb(clip(posterior, params, COARSE).posterior, params, steps=STEPS).params
+        params = _unfolded(posterior, params, plain)
         if _lost(field, peaks, params[field.columns]) < LOST_AT_MOST:
             return Start(params, "matched peaks and a first climb", matched)
     grown = _unfolded(posterior, outward(field, plain), plain)
@@ -347,7 +348,7 @@ def _lost(field: Field, peaks: Floats, z: Floats) -> float:
 
 def outward(field: Field, params: Floats) -> Floats:
     """Parameters climbed to on disks around the axis, each as far as the one before foretells stars within the PSF's width."""
-    posterior = field.posterior
+    posterior, params = field.posterior, params.copy()
     sigma = posterior.model.psf.sigma
     pixels = np.hypot(*np.meshgrid(*posterior.model.detector.pixel_centres()))
     covariance, radius, width = np.diag(field.scale**2), 0.0, np.inf
@@ -363,9 +364,10 @@ def outward(field: Field, params: Floats) -> Floats:
         if not disk.any():
             continue
         part = _part(posterior, distance < radius + 4.0 * width, disk, width)
-        index = [part.parameter_names.index(name) for name in posterior.parameter_names]
+        shared = [k for k, name in enumerate(posterior.parameter_names) if name in part.parameter_names]
+        index = [part.parameter_names.index(posterior.parameter_names[k]) for k in shared]
         begin, background = part.start(), part.parameter_names.index("background")
-        begin[index] = np.clip(params, *posterior.support)
+        begin[index] = np.clip(params, *posterior.support)[shared]
         begin[background] = part.start()[background]
         begin = _unfolded(part, begin, part.start())
         if not np.isfinite(part.log_prob(begin)):
@@ -373,7 +375,7 @@ def outward(field: Field, params: Floats) -> Floats:
         top = climb(clip(part, begin, COARSE).posterior, begin, steps=STEPS)
         if not np.isfinite(top.distance):
             break
-        params, columns = top.params[index], [index[k] for k in field.columns]
+        params[shared], columns = top.params[index], [index[shared.index(k)] for k in field.columns]
         # photons measure bright stars better than the model is right: no star counts for more than a centroid
         sources, places = field.everyone[inside], field.predict(params[field.columns])[inside]
         params[field.columns], error = field.fit(sources, places, CENTROID * width)
@@ -386,13 +388,12 @@ def _part(posterior: Posterior, sources: Flags, pixels: Flags, width: float) -> 
     model, s = posterior.model, posterior.model.sources
     blur = np.sqrt(width**2 - model.psf.sigma**2) / model.detector.binning
     few = SourceCatalog(s.x[sources], s.y[sources], s.flux[sources])
+    flux = posterior.nuisances.flux
     return Posterior(
         replace(model, sources=few, psf=GaussianPSF(width) if blur > 0 else model.psf),
         ndimage.gaussian_filter(posterior.counts, blur) if blur > 0 else posterior.counts,
-        prior=posterior.prior,
+        prior={name: prior for name, prior in posterior.prior.items() if name != "position_scatter"},
         noise=posterior.noise,
         mask=pixels,
-        nuisances=replace(
-            posterior.nuisances, flux="scale" if posterior.nuisances.flux == "free" else posterior.nuisances.flux, footprint=None
-        ),
+        nuisances=replace(posterior.nuisances, flux="scale" if flux == "free" else flux, footprint=None, position_scatter=False),
     )
