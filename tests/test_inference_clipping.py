@@ -1,10 +1,12 @@
 """Sigma clipping: spots of no source, and sources without a spot, are left out, and the error bars of the rest hold."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -88,6 +90,40 @@ def test_what_is_masked_is_the_light_of_the_spots() -> None:
     light = foreign.expected_counts(truth[: COMPLETE.n_terms]) / found.posterior.sigma(truth)
     assert light[found.posterior.mask].max() < 0.5  # standard deviations
     assert found.posterior.mask[light < 1e-6].all()
+
+
+def test_a_faint_neighbour_of_a_bright_spot_is_not_missing() -> None:
+    sources = SourceCatalog([0.0, 30.0, -30.0, 0.0], [0.0, 30.0, 30.0, -35.0], [2e3, FLUX, FLUX, FLUX])
+    model = ForwardModel(Detector((101, 101)), sources, GaussianPSF(2.0), COMPLETE)
+    theta = np.zeros(COMPLETE.n_terms)
+    foreign = replace(model, sources=SourceCatalog([6.0, *sources.x], [0.0, *sources.y], [4e4, *sources.flux]))
+    posterior = Posterior(model, simulate(foreign, theta, BACKGROUND, seed=1))
+    found = clip(posterior, np.append(theta, BACKGROUND))
+    assert not found.missing.any() and not found.posterior.mask[50, 56]
+    # negative control: in the filtered frame it stands in the spot's dark ring, and lacks more than its light
+    residual = posterior.counts - posterior.expected_counts(np.append(theta, BACKGROUND))
+    assert ndimage.gaussian_laplace(residual, 2.0)[50, 50] > 2e3 / (4.0 * np.pi * 2.0**4)
+    # and the other way round: the faint source is missing, the spot, now in the catalogue, is there
+    without = replace(model, sources=SourceCatalog([6.0, *sources.x[1:]], [0.0, *sources.y[1:]], [4e4, *sources.flux[1:]]))
+    lacking = Posterior(foreign, simulate(without, theta, BACKGROUND, seed=1))
+    assert np.flatnonzero(clip(lacking, np.append(theta, BACKGROUND)).missing).tolist() == [1]
+
+
+def test_spots_are_bent_as_the_distortion_bends_them() -> None:
+    """At the corner of a field that is stretched there by a fifth what a round spot leaves stands out; a bent one does not."""
+    model = ForwardModel(Detector((181, 181)), SourceCatalog.grid(7, 25.0, 3e4), GaussianPSF(3.0), COMPLETE)
+    theta = np.zeros(COMPLETE.n_terms)
+    theta[[COMPLETE.names.index("f_u2x"), COMPLETE.names.index("g_v2y")]] = -2e-5
+    star = ForwardModel(model.detector, SourceCatalog([70.0], [65.0], [3e4]), model.psf, COMPLETE)
+    posterior = Posterior(model, simulate(model, theta, BACKGROUND, seed=1) + simulate(star, theta, 0.0, seed=2))
+    found = clip(posterior, np.append(theta, BACKGROUND))
+    noise = found.posterior.sigma(np.append(theta, BACKGROUND))
+    light = star.expected_counts(theta) / noise
+    assert light[found.posterior.mask].max() < 0.5 and not found.missing.any()
+    # negative control: what a round spot in its place does not cover
+    u, v = COMPLETE.image_position(theta, 70.0, 65.0)
+    round_spot = replace(star, sources=SourceCatalog([float(u)], [float(v)], [3e4])).expected_counts(np.zeros_like(theta))
+    assert light[round_spot < 0.3 * noise].max() > 0.5
 
 
 def test_dead_pixels_are_masked() -> None:

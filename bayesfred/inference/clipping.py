@@ -22,6 +22,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, spatial
 
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.maps import image_positions
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.ascent import climb
@@ -138,22 +140,21 @@ class _Look:
             if not row.size:
                 break
             flux = self.height * excess[row, column]
-            absent = self._absent(np.stack([row, column], axis=1), flux, missing)
+            places = vertex(height, row, column)
+            absent = self._absent(places, flux, missing)
             missing[absent[absent >= 0]] = True
             if missing.all():
                 break
             if np.any(absent >= 0):
                 expected = _part(p, missing, p.mask).expected_counts(self.params)
-            spots = np.zeros_like(light)
-            spots[row, column] = np.where(absent < 0, flux, 0.0)
-            light += ndimage.gaussian_filter(spots, s, truncate=6.0)
-            spread = ndimage.maximum_filter(np.abs(light), 2 * int(np.ceil(0.25 * s)) + 1)  # between pixels, of another width
+            light += self._image(places[absent < 0], flux[absent < 0])
+            spread = ndimage.maximum_filter(np.abs(light), 2 * int(np.ceil(0.25 * s)) + 1)  # of another width
             mask = p.mask & (spread <= FAINT * p.noise.fisher_weight(expected, self.level) ** -0.5)
             if self.too_many(missing | ~mask[self.row, self.column]):
                 break
         return missing, mask
 
-    def _absent(self, places: Ints, flux: Floats, missing: Flags) -> Ints:
+    def _absent(self, places: Floats, flux: Floats, missing: Flags) -> Ints:
         """The source whose absence leaves a dark spot with this flux, shape (number of spots,); -1 where none does."""
         absent = np.full(flux.size, -1)
         there = np.flatnonzero(self.inside & ~missing)
@@ -166,8 +167,46 @@ class _Look:
                 absent[k] = there[near[k][np.argmin(unlike)]]
         return absent
 
+    def _image(self, places: Floats, flux: Floats) -> Floats:
+        """Spots as the sources' distortion makes them, shape (ny, nx); those that it cannot have made, as the PSF alone."""
+        model = self.posterior.model
+        assert isinstance(model.distortion, PolynomialDistortion), "what is not polynomial is not fitted"
+        theta = self.params[: model.distortion.n_terms]
+        v, u = (places - 0.5 * (np.array(model.detector.shape) - 1.0)).T * model.detector.binning
+        x, y = model.distortion.object_position(theta, u, v)
+        bent = np.isfinite(x + y)
+        image = _bright(model, theta, x[bent], y[bent], flux[bent])
+        if not np.isfinite(image).all():
+            bent[:], image = False, np.zeros_like(image)
+        return image + _bright(model, np.zeros_like(theta), u[~bent], v[~bent], flux[~bent])
+
     def _filtered(self, image: Floats) -> Floats:
         return np.asarray(-ndimage.gaussian_laplace(np.where(self.posterior.mask, image, 0.0), self.width))
+
+
+def _bright(model: ForwardModel, theta: Floats, x: Floats, y: Floats, flux: Floats) -> Floats:
+    """The image of sources of which some take light away, shape (ny, nx)."""
+    image = np.zeros(model.detector.shape)
+    for sign in (1.0, -1.0):
+        some = sign * flux > 0.0
+        if some.any():
+            image += sign * replace(model, sources=SourceCatalog(x[some], y[some], np.abs(flux[some]))).expected_counts(theta)
+    return image
+
+
+def vertex(image: Floats, row: Ints, column: Ints) -> Floats:
+    """Places of peaks between pixels, shape (n, 2), where a parabola through three pixels has its vertex."""
+    ny, nx = image.shape
+    top = image[row, column]
+
+    def shift(before: Floats, after: Floats) -> Floats:
+        curvature = before + after - 2.0 * top
+        along = np.zeros_like(top)  # along a ridge
+        return np.asarray(np.divide(0.5 * (before - after), curvature, out=along, where=curvature < 0.0))
+
+    up = shift(image[np.maximum(row - 1, 0), column], image[np.minimum(row + 1, ny - 1), column])
+    right = shift(image[row, np.maximum(column - 1, 0)], image[row, np.minimum(column + 1, nx - 1)])
+    return np.stack([row + up, column + right], axis=1)
 
 
 def _part(posterior: Posterior, missing: Flags, mask: Flags) -> Posterior:

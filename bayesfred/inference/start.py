@@ -28,7 +28,7 @@ from bayesfred.imaging.kernels.maps import image_positions
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference.ascent import climb
-from bayesfred.inference.clipping import COARSE, STEPS, clip
+from bayesfred.inference.clipping import COARSE, STEPS, clip, vertex
 from bayesfred.inference.posterior import Posterior
 
 Floats = npt.NDArray[np.float64]
@@ -176,18 +176,9 @@ def find_peaks(posterior: Posterior) -> Floats:
     peak &= used > 0.5 * block**2
     peak[[0, -1]] = peak[:, [0, -1]] = False
     j, i = np.nonzero(peak)
-    top = filtered[j, i]
-
-    def vertex(before: Floats, after: Floats) -> Floats:
-        curvature = before + after - 2.0 * top
-        shift = np.zeros_like(top)  # along a ridge
-        return np.asarray(np.divide(0.5 * (before - after), curvature, out=shift, where=curvature < 0.0))
-
-    i_peak = i + vertex(filtered[j, i - 1], filtered[j, i + 1])
-    j_peak = j + vertex(filtered[j - 1, i], filtered[j + 1, i])
-    # from a block's index to the frame's middle, in fine pixels
-    place = [(block * (k + 0.5) - 0.5 * n) * step for k, n in ((i_peak, detector.shape[1]), (j_peak, detector.shape[0]))]
-    return np.stack(place, axis=1)[np.argsort(-top)[: 3 * len(posterior.model.sources)]]
+    order = np.argsort(-filtered[j, i])[: 3 * len(posterior.model.sources)]
+    places = block * (vertex(filtered, j, i)[order] + 0.5) - 0.5 * np.array(detector.shape)
+    return np.asarray(places[:, ::-1] * step)  # from a block's index to the frame's middle, in fine pixels
 
 
 def _alone(model: ForwardModel) -> Flags:
