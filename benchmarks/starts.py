@@ -6,8 +6,8 @@ catalogue's stars missing from the frame and as many spots that are in no catalo
 the search starts at the truth. Results go to a file, one line a problem: a run that was stopped goes on where it was.
 
 Fits are sigma-clipped, because no maximum of a posterior of all the spots is near the truth. The one from the truth is clipped from
-the truth, too, and may leave out other spots where it is close. The last column says how often the truth is as near to the maximum as
-error bars that hold promise in 99.9 %. A truth that folds the frame is outside the prior, and not drawn.
+the truth, too, and may leave out other spots where it is close. The last column says how often the truth is as near to the maximum
+as error bars that hold promise in 99.9 %. A truth that folds the frame is outside the prior, and not drawn.
 """
 
 import argparse
