@@ -173,6 +173,8 @@ def test_masked_pixels_hold_nothing_to_clip() -> None:
     counts = np.where(mask, posterior.counts, 1e6)
     masked = Posterior(posterior.model, counts, mask=mask)
     assert clip(masked, truth).posterior is masked
+    clipped, estimate = sigma_clip(masked)
+    assert clipped is masked and "left out" not in estimate.message
 
 
 def test_clean_frames_are_fitted_whole() -> None:

@@ -11,7 +11,7 @@ a missing source or as a spot of its own, and the others looked for in what thes
 
 Parameters that are wrong make every bright star stand out. So what may still be their fault is tolerated: a share of the light
 of the stars nearby, the smallest one with which most stars remain. Fitted to these the parameters get better and the share
-smaller, until it is zero: then the same is left out that the true parameters would leave out, wherever the search began.
+smaller, until it is zero: then, but for close calls, what the true parameters would leave out is left out, wherever it began.
 """
 
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ class Clipped(NamedTuple):
     masked : int
         Pixels of the given posterior that are not in this one.
     lost : ndarray of bool, shape (n,)
-        The missing sources, and those that the mask hides.
+        The missing sources, and those whose middle is masked.
     """
 
     posterior: Posterior

@@ -219,8 +219,7 @@ def _search(
                     "start: the posterior has no density there, expected parameters within the prior whose map does not fold"
                 )
             fisher = posterior.fisher(begun.params)
-            weak = undetermined(posterior, begun.params, fisher)
-            if weak:
+            if top is None and (weak := undetermined(posterior, begun.params, fisher)):
                 raise InputError(
                     f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than "
                     "their noise: leave out terms, add sources, or give these parameters a narrower prior"
@@ -252,7 +251,7 @@ def _judged(found: Clipped, top: Ascent, evaluations: int, how: str) -> MapEstim
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
     message = f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} evaluations{how}"
-    if found.lost.any() or found.masked:
+    if found.missing.any() or found.masked:
         message += f", {found.missing.sum()} sources and {found.masked} pixels left out"
     bounds = zip(posterior.parameter_names, top.params, *posterior.support, strict=True)
     if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
@@ -282,7 +281,7 @@ def _advice(excess: float, found: Clipped) -> str:
     if excess > 0:
         spots = (
             ""
-            if found.lost.any() or found.masked
+            if found.missing.any() or found.masked
             else ", or sources that the catalogue lacks or the frame misses (sigma_clip leaves them out)"
         )
         return (
