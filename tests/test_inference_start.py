@@ -1,6 +1,7 @@
 """Starts from counts alone: peaks, matching outward, growing disks; and what `find_map` says about where it ended."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.imaging.scene import SourceCatalog
 from bayesfred.inference import ascent, estimate, start
 from bayesfred.inference.ascent import Ascent, climb
-from bayesfred.inference.estimate import find_map
+from bayesfred.inference.estimate import find_map, sigma_clip
 from bayesfred.inference.noise import BackgroundNoise, simulate
 from bayesfred.inference.posterior import Nuisances, Posterior
 from bayesfred.inference.start import Field, find_peaks, find_start, match, outward
@@ -263,6 +264,18 @@ def test_stars_too_faint_for_peaks_are_found_on_a_growing_disk() -> None:
     assert found.log_prob == pytest.approx(best.log_prob, abs=1e-3)
     # negative control: the same climb from where the disk began is trapped
     assert climb(posterior, posterior.start()).log_prob < best.log_prob - 100.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_source_of_next_to_no_flux_overflows_nothing() -> None:
+    model = grid(3)
+    flux = np.append(5e-324, model.sources.flux[1:])
+    faint = replace(model, sources=SourceCatalog(model.sources.x, model.sources.y, flux))
+    posterior = Posterior(faint, simulate(model, np.zeros(faint.distortion.n_terms), 2.0, seed=1))
+    assert not Field(posterior).alone[0] and Field(posterior).alone[8]
+    assert np.isfinite(posterior.log_prob(find_start(posterior).params))
+    clipped, _ = sigma_clip(posterior)  # its spot belongs to no source that is bright enough
+    assert not clipped.mask.all()
 
 
 def test_a_disk_grows_where_positions_scatter_too() -> None:

@@ -162,7 +162,7 @@ class _Look:
             return absent
         near = spatial.cKDTree(self.places[there]).query_ball_point(places, self.width)
         for k in np.flatnonzero(flux < 0.0):
-            unlike = np.abs(np.log(self.flux[there[near[k]]] / -flux[k]))
+            unlike = np.abs(np.log(self.flux[there[near[k]]]) - np.log(-flux[k]))
             if unlike.min(initial=np.inf) < np.log(ALIKE):
                 absent[k] = there[near[k][np.argmin(unlike)]]
         return absent

@@ -193,7 +193,8 @@ def _alone(model: ForwardModel) -> Flags:
     source, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     d = place[other] - place[source]
     q = (d**2).sum(axis=1) / (4.0 * model.psf.sigma**2)
-    each = d.T * (1.0 - 0.5 * q) * np.exp(-q) * s.flux[other] / s.flux[source]
+    r = s.flux[other] / np.maximum(s.flux[source], 1e-9 * s.flux[other])  # or it overflows, of a flux of next to nothing
+    each = d.T * (1.0 - 0.5 * q) * np.exp(-q) * r
     shift = [np.bincount(source, along, len(s)) for along in each]
     return np.asarray(np.hypot(*shift) < CROWDED * model.psf.sigma)
 
