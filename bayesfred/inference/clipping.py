@@ -53,22 +53,19 @@ class Clipped(NamedTuple):
         Of the sources and pixels that remain; the very one that was given where nothing is left out.
     missing : ndarray of bool, shape (n,)
         Which sources of the given posterior are not in this one.
-    masked : int
-        Pixels of the given posterior that are not in this one.
     lost : ndarray of bool, shape (n,)
         The missing sources, and those whose middle is masked.
     """
 
     posterior: Posterior
     missing: Flags
-    masked: int
     lost: Flags
 
 
 def whole(posterior: Posterior, params: Floats) -> tuple[Clipped, Floats, int]:
-    """All of a posterior and the same parameters: what `settle` returns where nothing stands out, without a look."""
+    """All of a posterior, and the same parameters: `settle` without clipping."""
     none = np.zeros(len(posterior.model.sources), bool)
-    return Clipped(posterior, none, 0, none), params, 0
+    return Clipped(posterior, none, none), params, 0
 
 
 def settle(posterior: Posterior, params: Floats) -> tuple[Clipped, Floats, int]:
@@ -95,8 +92,7 @@ def clip(posterior: Posterior, params: Floats, tolerances: Sequence[float] = TOL
         missing, mask = look.outliers(tolerance)
         lost = missing | ~mask[look.row, look.column]
         if mask.any() and not look.too_many(lost):
-            masked = int(np.sum(posterior.mask & ~mask))
-            return Clipped(_part(posterior, missing, mask if masked else posterior.mask), missing, masked, lost)
+            return Clipped(_part(posterior, missing, mask), missing, lost)
     return whole(posterior, params)[0]
 
 
@@ -214,7 +210,7 @@ def _part(posterior: Posterior, missing: Flags, mask: Flags) -> Posterior:
     model, s = posterior.model, posterior.model.sources
     if missing.any():
         model = replace(model, sources=SourceCatalog(s.x[~missing], s.y[~missing], s.flux[~missing]))
-    elif mask is posterior.mask:
+    elif np.array_equal(mask, posterior.mask):
         return posterior
     noise, nuisances = posterior.noise, posterior.nuisances
     return Posterior(model, posterior.counts, prior=posterior.prior, noise=noise, mask=mask, nuisances=nuisances)

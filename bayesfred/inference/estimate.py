@@ -218,8 +218,8 @@ def _search(
                 raise InputError(
                     "start: the posterior has no density there, expected parameters within the prior whose map does not fold"
                 )
-            fisher = posterior.fisher(begun.params)
-            if top is None and (weak := undetermined(posterior, begun.params, fisher)):
+            fisher = posterior.fisher(begun.params) if top is None else None
+            if fisher is not None and (weak := undetermined(posterior, begun.params, fisher)):
                 raise InputError(
                     f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the counts by more than "
                     "their noise: leave out terms, add sources, or give these parameters a narrower prior"
@@ -232,7 +232,7 @@ def _search(
             if again.distance < CLOSENESS:
                 break
         assert top is not None, "a first start"
-        return found.posterior, _judged(found, top, evaluations, how)
+        return found.posterior, _judged(posterior, found.posterior, top, evaluations, how)
 
 
 def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Iterator[Start]:
@@ -245,21 +245,21 @@ def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Ite
     yield from other_starts(posterior, begun)
 
 
-def _judged(found: Clipped, top: Ascent, evaluations: int, how: str) -> MapEstimate:
-    """Whether it is a maximum, and whether the model fits there."""
-    posterior = found.posterior
+def _judged(given: Posterior, posterior: Posterior, top: Ascent, evaluations: int, how: str) -> MapEstimate:
+    """Whether it is a maximum of what is left of the posterior that was given, and whether the model fits there."""
     at_maximum = top.distance < CLOSENESS
     excess = _excess(posterior, top.params)
     message = f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} evaluations{how}"
-    if found.missing.any() or found.masked:
-        message += f", {found.missing.sum()} sources and {found.masked} pixels left out"
+    if posterior is not given:
+        sources = len(given.model.sources) - len(posterior.model.sources)
+        message += f", {sources} sources and {given.mask.sum() - posterior.mask.sum()} pixels left out"
     bounds = zip(posterior.parameter_names, top.params, *posterior.support, strict=True)
     if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
         message += f", {', '.join(at_bound)} at a bound of the prior"
     if not at_maximum:
         message = f"not found, {message}: begin elsewhere (start), fit fewer terms, or narrow the priors"
     elif not abs(excess) <= CONSISTENT:
-        message = f"found, {message}; {_advice(excess, found)}"
+        message = f"found, {message}; {_advice(excess, clipped=posterior is not given)}"
     else:
         message = f"found, {message}; residuals as the noise makes them"
     converged = at_maximum and abs(excess) <= CONSISTENT
@@ -276,14 +276,10 @@ def _excess(posterior: Posterior, params: Floats) -> float:
     return float((fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"])
 
 
-def _advice(excess: float, found: Clipped) -> str:
+def _advice(excess: float, *, clipped: bool) -> str:
     """What to do about residuals that are not those of the noise."""
     if excess > 0:
-        spots = (
-            ""
-            if found.missing.any() or found.masked
-            else ", or sources that the catalogue lacks or the frame misses (sigma_clip leaves them out)"
-        )
+        spots = "" if clipped else ", or sources that the catalogue lacks or the frame misses (sigma_clip leaves them out)"
         return (
             f"but the residuals exceed the noise (deviance {excess:.0f} standard deviations above its expectation): look at "
             f"them for a PSF or fluxes that are not right, terms left out{spots}"
