@@ -217,9 +217,9 @@ def trace_plot(chain: Chain) -> Figure:
     rows = -(-d // 2)
     fig = Figure(figsize=(13, 0.9 + 1.25 * rows), dpi=100)
     # the third column keeps a distance
-    axes = fig.subplots(rows, 5, squeeze=False, width_ratios=(4, 1, 0.65, 4, 1))
+    axes = fig.subplots(rows, 5, squeeze=False, width_ratios=(4, 1, 0.8, 4, 1))
     height = fig.get_figheight()
-    fig.subplots_adjust(left=0.07, right=0.99, bottom=0.5 / height, top=1 - 0.4 / height, wspace=0.06, hspace=0.2)
+    fig.subplots_adjust(left=0.08, right=0.99, bottom=0.5 / height, top=1 - 0.4 / height, wspace=0.1, hspace=0.2)
     steps = np.unique(np.linspace(0, n_steps - 1, min(n_steps, MAX_TRACE_STEPS)).astype(int))
     for k, name in enumerate(chain.parameter_names):
         # down the first pair of columns, then down the second, as the table of parameters runs
@@ -237,7 +237,7 @@ def trace_plot(chain: Chain) -> Figure:
         trace.ticklabel_format(axis="y", useOffset=False)
         trace.yaxis.set_major_locator(MaxNLocator(3))
         trace.set_ylabel(_label(name, exponent, "\n"), fontsize=8.5)
-        trace.yaxis.set_label_coords(-0.095, 0.5)
+        trace.yaxis.set_label_coords(-0.12, 0.5)
         trace.tick_params(labelsize=7)
         _rank_histogram(ranks, values[:, chain.burn_in :, :, k])
         last = k % rows == rows - 1 or k == d - 1
