@@ -110,20 +110,20 @@ def test_a_faint_neighbour_of_a_bright_spot_is_not_missing() -> None:
 
 
 def test_spots_are_bent_as_the_distortion_bends_them() -> None:
-    """At the corner of a field that is stretched there by a fifth what a round spot leaves stands out; a bent one does not."""
-    model = ForwardModel(Detector((181, 181)), SourceCatalog.grid(7, 25.0, 3e4), GaussianPSF(3.0), COMPLETE)
+    """Near the corner of a field that makes spots a third wider there, looks with round spots leave 3.9 instead of 0.2."""
+    model = ForwardModel(Detector((201, 201)), SourceCatalog.grid(7, 25.0, 3e4), GaussianPSF(3.0), COMPLETE)
     theta = np.zeros(COMPLETE.n_terms)
-    theta[[COMPLETE.names.index("f_u2x"), COMPLETE.names.index("g_v2y")]] = -2e-5
-    star = ForwardModel(model.detector, SourceCatalog([70.0], [65.0], [3e4]), model.psf, COMPLETE)
+    theta[[COMPLETE.names.index("f_u2x"), COMPLETE.names.index("g_v2y")]] = -4e-5
+    star = replace(model, sources=SourceCatalog([62.0], [62.0], [3e5]))
     posterior = Posterior(model, simulate(model, theta, BACKGROUND, seed=1) + simulate(star, theta, 0.0, seed=2))
     found = clip(posterior, np.append(theta, BACKGROUND))
     noise = found.posterior.sigma(np.append(theta, BACKGROUND))
     light = star.expected_counts(theta) / noise
     assert light[found.posterior.mask].max() < 0.5 and not found.missing.any()
     # negative control: what a round spot in its place does not cover
-    u, v = COMPLETE.image_position(theta, 70.0, 65.0)
-    round_spot = replace(star, sources=SourceCatalog([float(u)], [float(v)], [3e4])).expected_counts(np.zeros_like(theta))
-    assert light[round_spot < 0.3 * noise].max() > 0.5
+    u, v = COMPLETE.image_position(theta, 62.0, 62.0)
+    round_spot = replace(model, sources=SourceCatalog([float(u)], [float(v)], [3e5])).expected_counts(np.zeros_like(theta))
+    assert light[round_spot < 0.3 * noise].max() > 2.0
 
 
 def test_dead_pixels_are_masked() -> None:
