@@ -1,6 +1,5 @@
-"""What compiled functions are decorated with, exp2 and log in a form that vectorises, and a counter that threads share."""
+"""Arithmetic that vectorises: exp2, log and the relaxed rules they are compiled by; and a counter that threads share."""
 
-from functools import partial
 from typing import Any
 
 import numba as nb
@@ -10,10 +9,6 @@ from numba.extending import intrinsic
 # Reassociation is left out where a result's last digits matter: it would undo the range reduction of exp2.
 FAST = {"contract", "arcp", "nsz", "nnan", "ninf"}
 REDUCE = FAST | {"reassoc"}
-
-# For functions that only compiled code calls (Python must not: it would crash): wrappers for other callers would add a seventh
-# to the time of compilation.
-inner = partial(nb.njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 LOG2_E = 1.4426950408889634
 

@@ -4,9 +4,8 @@ On a row of pixels a^2 + b^2 and D are polynomials in u alone: a sample of a Gau
 exponential.
 """
 
-import numba as nb
-
-from bayesfred.imaging.kernels.elementary import FAST, inner
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.elementary import FAST
 from bayesfred.imaging.kernels.maps import Maps, footprints, locate, new_maps, new_work, row_starts
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.profiles import psf_arguments, psf_slopes, psf_value
@@ -14,7 +13,7 @@ from bayesfred.imaging.kernels.profiles import psf_arguments, psf_slopes, psf_va
 BATCH = 32  # sources whose rows are listed at a time: of many sources the list would outgrow the caches
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def add_source(o, maps, fp, s, first, last, sigma, flux, at, out, work, place, stamps):
     """Add the rows of source s from `first` to `last` to `out`, the samples of row i from at[i] on.
 
@@ -49,7 +48,7 @@ def add_source(o, maps, fp, s, first, last, sigma, flux, at, out, work, place, s
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
     """Like `add_source` at unit flux, and F X and F Y beside it: X = -p_a |D| is K's derivative as s moves along a."""
     u, v = maps.peak[s, 0], maps.peak[s, 1]
@@ -82,7 +81,7 @@ def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
                     row_b[n] += flux * k_b * abs(j)
 
 
-@nb.njit(cache=True, nogil=True)
+@entry()
 def image(o, theta, offset_x, offset_y, sigma, flux, out):
     """Add all sources to the padded, flattened image `out`. Returns False where a source's map folds."""
     maps = new_maps(o)

@@ -6,7 +6,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE
 from bayesfred.imaging.kernels.maps import footprints, locate, new_maps, new_work
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.profiles import psf_bends, psf_slopes
@@ -97,7 +98,7 @@ def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, d
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) / sigma
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def _samples_row(psf, sigma, weight, template, ramp, t, ra, rb, rd, degree, d_degree, e, size, signed, along_a, along_b):
     """P |D|, s P, P_a |D| and P_b |D| of a template at u - u_peak from t on, the names being those of `basis_row`."""
     _polynomial_row(along_a, ramp, t, ra, degree)
@@ -145,7 +146,7 @@ def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start)
                 row[i] += bx * lower[i] * first[i]
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, powers, work):
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
@@ -201,7 +202,7 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _weigh_row(weight, size, a, b, e):
     """Multiply a, b and e by the weight; returns the sum of weight times size."""
     total = 0.0
@@ -213,7 +214,7 @@ def _weigh_row(weight, size, a, b, e):
     return total
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _two_moments(power, ramp, t0, a, b, e, out):
     """Sums of a, b and e times power and times power t, at t = t0 + ramp[i], into the columns of out; power becomes power t^2."""
     a0, a1, b0, b1, e0, e1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -230,7 +231,7 @@ def _two_moments(power, ramp, t0, a, b, e, out):
     out[0, 0], out[0, 1], out[1, 0], out[1, 1], out[2, 0], out[2, 1] = a0, a1, b0, b1, e0, e1
 
 
-@inner(cache=True)
+@inner()
 def _multiply_out(e, a, b, degree, f_u, f_v, g_u, g_v):
     """From sums over t^m w^n times E, e[m, n], to those times b_v E, -b_u E, -a_v E and a_u E."""
     top = len(degree)
@@ -245,7 +246,7 @@ def _multiply_out(e, a, b, degree, f_u, f_v, g_u, g_v):
                     g_v[m, n] += (k + 1) * a[k + 1, i] * e[m + k, n + i]
 
 
-@inner(cache=True)
+@inner()
 def _shift_sums(sums, h, k, degree):
     """From sums over t^m w^n to sums over (t + h)^m (w + k)^n, in place."""
     top = len(degree)
@@ -259,7 +260,7 @@ def _shift_sums(sums, h, k, degree):
                 sums[m, n] += k * sums[m, n - 1]
 
 
-@inner(cache=True)
+@inner()
 def _add_sums(basis_powers, along, first, second, out):
     """Add to out the sums over B along + B_u first + B_v second for the monomials B = u^m v^n of f (or of g)."""
     for k in range(basis_powers.shape[0]):
@@ -271,7 +272,7 @@ def _add_sums(basis_powers, along, first, second, out):
             out[k] += n * second[m, n - 1]
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples, sums, work):
     """Add to out[k] the sum over a source's pixels of weight times row k of the basis, see `basis_row`.
 
@@ -329,7 +330,7 @@ def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples,
     _add_sums(basis.g, sums[1], sums[5], sums[6], out[n_f : n_f + n_g])
 
 
-@inner(cache=True, fastmath=FAST)
+@inner(fastmath=FAST)
 def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
     work = new_work(o)
@@ -354,7 +355,7 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
                         target[i] += c * source[i]
 
 
-@nb.njit(cache=True, nogil=True)
+@entry()
 def jacobian(o, theta, sigma, flux, basis, out):
     """d image / d parameters into out (parameters, ny, padded row)."""
     maps = new_maps(o)

@@ -14,11 +14,11 @@ D = a_u b_v - a_v b_u, multiplied out once per source.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, inner
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.elementary import FAST
 from bayesfred.imaging.kernels.polynomials import evaluate, multiply, shift
 from bayesfred.imaging.kernels.profiles import Gaussian, Moffat, Spline
 
@@ -79,7 +79,7 @@ def stride(nx: int) -> int:
     return (-(-(nx + LANES) // SEGMENT) | 1) * SEGMENT
 
 
-@inner(cache=True)
+@inner()
 def new_maps(o):
     """Room for the maps of all sources."""
     size = o.x.size
@@ -89,13 +89,13 @@ def new_maps(o):
     return Maps(a, b, q, d, np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
 
 
-@inner(cache=True)
+@inner()
 def new_work(o):
     """Room for a row's polynomials."""
     return np.empty((7, 2 * len(o.degree) + 1))
 
 
-@inner(cache=True)
+@inner()
 def _fill(o, s, theta, offset_x, offset_y, a, b):
     """Coefficients of a and b of source s in powers of u and v, about the frame's middle."""
     a[:] = 0.0
@@ -111,7 +111,7 @@ def _fill(o, s, theta, offset_x, offset_y, a, b):
         b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_lever[s, k]
 
 
-@inner(cache=True)
+@inner()
 def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     """Newton's iteration for a = b = 0, leaving a and b expanded about the solution. Returns u, v, found."""
     u = o.x[s] + offset_x
@@ -142,7 +142,7 @@ def _find_peak(o, s, theta, offset_x, offset_y, a, b):
     return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
 
 
-@inner(cache=True)
+@inner()
 def _reach(o, a, b, u, v, radius, core, bounds, stack):
     """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius, -1 if D <= 0 where it is <= core.
 
@@ -180,7 +180,7 @@ def _reach(o, a, b, u, v, radius, core, bounds, stack):
     return reach + margin if reach >= 0.0 else -1.0
 
 
-@inner(cache=True)
+@inner()
 def _rest(bounds, d):
     """rho at distance d."""
     rest = 0.0
@@ -189,7 +189,7 @@ def _rest(bounds, d):
     return rest * d
 
 
-@inner(cache=True)
+@inner()
 def _survey(o, a, b, u, v, radius, core, bounds, stack):
     """The largest |J d| in the frame where |(a, b)| <= radius, at most; -1 if D <= 0 where |(a, b)| <= core.
 
@@ -229,7 +229,7 @@ def _survey(o, a, b, u, v, radius, core, bounds, stack):
     return reach
 
 
-@inner(cache=True)
+@inner()
 def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
     """Fill `maps`; False where a source has no image, or the map folds (D <= 0) within two of the PSF's widths of one.
 
@@ -266,7 +266,7 @@ def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
     return unfolded
 
 
-@inner(cache=True)
+@inner()
 def move(o, maps, s, by_x, by_y):
     """Shift source s along a and b."""
     maps.a[s, 0, 0] -= by_x
@@ -274,7 +274,7 @@ def move(o, maps, s, by_x, by_y):
     multiply(maps.a[s], maps.b[s], len(o.d_degree) > 0, maps.q[s], maps.d[s])
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def footprints(o, maps):
     """The rows of pixels that every source reaches, their lengths multiples of LANES."""
     sources, size = maps.peak.shape[0], 0
@@ -309,7 +309,7 @@ def footprints(o, maps):
     return Footprints(first, low[:i], count[:i], start[: i + 1], row[:i])
 
 
-@inner(cache=True)
+@inner()
 def row_starts(fp, pitch):
     """Where every row of pixels begins in a padded, flattened image."""
     at = np.empty(fp.row.size, np.int64)
@@ -318,7 +318,7 @@ def row_starts(fp, pitch):
     return at
 
 
-@nb.njit(cache=True)
+@entry()
 def image_positions(o, theta, offset_x, offset_y, sigma):
     """Where the sources are imaged, shape (s, 2); a source without an image stays at its place."""
     maps = new_maps(o)

@@ -4,10 +4,11 @@ On a row of pixels they are polynomials in u alone. Their degree reaches the inn
 compile-time constant, so that the loop over pixels vectorises for every degree.
 """
 
-from bayesfred.imaging.kernels.elementary import FAST, inner
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.elementary import FAST
 
 
-@inner(cache=True, fastmath={"contract"})
+@inner(fastmath={"contract"})
 def evaluate(c, u, v, degree):
     """The polynomial c and its derivatives with respect to u and v."""
     top = len(degree)
@@ -24,7 +25,7 @@ def evaluate(c, u, v, degree):
     return value, c_u, c_v
 
 
-@inner(cache=True)
+@inner()
 def shift(c, h, k, degree):
     """c(u, v) -> c(u + h, v + k) in place, by repeated synthetic division."""
     top = len(degree)
@@ -38,7 +39,7 @@ def shift(c, h, k, degree):
                 c[m, n] += k * c[m, n + 1]
 
 
-@inner(cache=True, fastmath=FAST)
+@inner(fastmath=FAST)
 def multiply(a, b, conserve, q, d):
     """Coefficients of a^2 + b^2, and of a_u b_v - a_v b_u if flux is conserved, else of 1."""
     q[:] = 0.0
@@ -54,7 +55,7 @@ def multiply(a, b, conserve, q, d):
                         d[n + j - 1, m + i - 1] += (m * j - n * i) * a[m, n] * b[i, j]
 
 
-@inner(cache=True, fastmath=FAST)
+@inner(fastmath=FAST)
 def map_on_row(a, b, w, ra, rb, rav, rbv, degree):
     """Coefficients in t = u - u_peak of a, b, a_v and b_v on the row at v = v_peak + w."""
     for m in range(len(degree) + 1):
@@ -68,7 +69,7 @@ def map_on_row(a, b, w, ra, rb, rav, rbv, degree):
         ra[m], rb[m], rav[m], rbv[m] = pa, pb, pav, pbv
 
 
-@inner(cache=True, fastmath=FAST)
+@inner(fastmath=FAST)
 def polynomial_on_row(c, w, factor, out, degree):
     """Coefficients in t of factor times the polynomial with coefficients c[n, m] of w^n t^m."""
     top = len(degree)

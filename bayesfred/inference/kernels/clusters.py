@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import REDUCE, inner
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.elementary import REDUCE
 
 Ints = npt.NDArray[np.int64]
 
@@ -28,7 +29,7 @@ class Clusters(NamedTuple):
     begin: Ints  # where the group's storage begins in a flat array
 
 
-@inner(cache=True)
+@inner()
 def bounding_boxes(fp):
     """First row, last row + 1, first column, last column + 1 of every footprint."""
     size = fp.first.size - 1
@@ -43,7 +44,7 @@ def bounding_boxes(fp):
     return boxes
 
 
-@inner(cache=True)
+@inner()
 def _group(keys, size):
     """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
     first = np.zeros(size + 2, np.int64)
@@ -58,7 +59,7 @@ def _group(keys, size):
     return order, first[:-1]
 
 
-@inner(cache=True)
+@inner()
 def find_clusters(boxes, ny, templates):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
@@ -110,7 +111,7 @@ def find_clusters(boxes, ny, templates):
     return Clusters(order[place], first, lead, start, begin)
 
 
-@inner(cache=True)
+@inner()
 def one_cluster(clusters, c, templates):
     """A group's members, and lead and start of its rows."""
     a, b = clusters.first[c], clusters.first[c + 1]
@@ -118,14 +119,14 @@ def one_cluster(clusters, c, templates):
     return clusters.members[a:b], clusters.lead[rows], clusters.start[rows]
 
 
-@inner(cache=True)
+@inner()
 def touch(boxes, s, t):
     """Whether two footprints may share pixels."""
     apart = boxes[t, 2] >= boxes[s, 3] or boxes[s, 2] >= boxes[t, 3] or boxes[t, 0] >= boxes[s, 1] or boxes[s, 0] >= boxes[t, 1]
     return not apart
 
 
-@inner(cache=True)
+@inner()
 def run_end(fp, s, i, at):
     """The first of a source's rows after row i that does not follow the one before it both in its template and in an image."""
     last = fp.first[s + 1]
@@ -135,7 +136,7 @@ def run_end(fp, s, i, at):
     return i
 
 
-@inner(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE, error_model="numpy")
 def dot(a, b, weight):
     """The sum of weight a b."""
     total = 0.0
@@ -144,7 +145,7 @@ def dot(a, b, weight):
     return total
 
 
-@inner(cache=True)
+@inner()
 def gram(fp, boxes, members, lead, start, stamps, weight, at, out):
     """out[i, k] = sum over pixels of weight T_i T_k, the lower triangle; a source's templates follow each other.
 
@@ -183,7 +184,7 @@ def gram(fp, boxes, members, lead, start, stamps, weight, at, out):
                             out[row + n] += dot(left, stamps[n, qs + a : qs + b], part)
 
 
-@inner(cache=True)
+@inner()
 def add_block(i, start, out, first_second, first_third, second, second_third, third):
     """Add to a source's own block of a matrix what its shifts are concerned with."""
     row, column = start[3 * i + 1 : 3 * i + 3], 3 * i
@@ -194,7 +195,7 @@ def add_block(i, start, out, first_second, first_third, second, second_third, th
     out[row[1] + column + 2] += third
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _inner(a, b):
     total = 0.0
     for i in range(a.size):
@@ -202,7 +203,7 @@ def _inner(a, b):
     return total
 
 
-@inner(cache=True)
+@inner()
 def cholesky(h, lead, start):
     """Lower triangle in place; False where the matrix is not positive definite."""
     for i in range(lead.size):
@@ -219,7 +220,7 @@ def cholesky(h, lead, start):
     return True
 
 
-@inner(cache=True)
+@inner()
 def solve(lower, lead, start, x):
     """x <- (L L^T)^-1 x, in place."""
     for i in range(x.size):
@@ -232,7 +233,7 @@ def solve(lower, lead, start, x):
             x[m] -= lower[at + m] * x[i]
 
 
-@inner(cache=True)
+@inner()
 def draw_template(fp, s, template, amplitude, at, out):
     """Add amplitude times one of a source's templates, shape (samples,), to an image."""
     i = fp.first[s]
@@ -245,7 +246,7 @@ def draw_template(fp, s, template, amplitude, at, out):
         i = end
 
 
-@inner(cache=True)
+@inner()
 def project(fp, s, template, image, at):
     """Sum over a source's pixels of one of its templates times an image."""
     total = 0.0

@@ -2,10 +2,9 @@
 
 import math
 
-import numba as nb
 import numpy as np
 
-from bayesfred.imaging.kernels.elementary import inner
+from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.jacobian import add_jacobian_rows
 from bayesfred.imaging.kernels.maps import SEGMENT, row_starts
 from bayesfred.inference.kernels.clusters import cholesky, dot, gram, one_cluster, solve
@@ -14,7 +13,7 @@ from bayesfred.inference.kernels.likelihood import LIMIT, POISSON, background_ro
 BAND = 16  # rows of the Jacobian held at a time
 
 
-@inner(cache=True)
+@inner()
 def _fisher_weight(counts, w, background):
     """Expected information 1 / variance per marked pixel into w.weight, zero where masked; returns the unmarked pixels."""
     ny = w.span.shape[0]
@@ -35,7 +34,7 @@ def _fisher_weight(counts, w, background):
     return pixels
 
 
-@nb.njit(cache=True, nogil=True)
+@entry()
 def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
     """Fisher information of source parameters, then the first `terms` background coefficients, fluxes profiled out.
 

@@ -17,11 +17,11 @@ which it weighs with residuals of mean zero; that makes it positive definite any
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner, take_turn
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE, take_turn
 from bayesfred.imaging.kernels.images import add_source, add_templates
 from bayesfred.imaging.kernels.maps import Footprints, Maps, footprints, locate, move, new_maps, new_work, row_starts
 from bayesfred.inference.kernels.clusters import (
@@ -74,7 +74,7 @@ class Drawn(NamedTuple):
     fitted: Fitted
 
 
-@inner(cache=True)
+@inner()
 def _patch(counts, w, fp, boxes, members, background, at):
     """A cluster's pixels, without sources; where its footprints' rows begin among them goes into `at`."""
     ny = w.span.shape[0]
@@ -109,7 +109,7 @@ def _patch(counts, w, fp, boxes, members, background, at):
     return patch
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def _weigh_patch(patch):
     """Score n/mu - 1 and weight n/mu^2 of Poisson counts, zero where masked."""
     values, background, image, score, weight = patch
@@ -120,7 +120,7 @@ def _weigh_patch(patch):
         weight[i] = n * inverse * inverse
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _flux_run(stamp, values, background):
     """Sums of template times counts less background, and of template squared."""
     above, below = 0.0, 0.0
@@ -131,7 +131,7 @@ def _flux_run(stamp, values, background):
     return above, below
 
 
-@inner(cache=True)
+@inner()
 def _first_flux(fp, s, template, patch, at):
     """Least-squares flux of one source, its neighbours ignored."""
     above, below = 0.0, 0.0
@@ -146,14 +146,14 @@ def _first_flux(fp, s, template, patch, at):
     return above / below if below > 0.0 else 0.0
 
 
-@inner(cache=True)
+@inner()
 def _make_templates(o, maps, fp, s, sigma, flux, stamps, work):
     """Fill the rows of source s in the templates `stamps`, shape (3, samples)."""
     stamps[:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] = 0.0
     add_templates(o, maps, fp, s, sigma, flux, stamps[0], stamps[1], stamps[2], work)
 
 
-@inner(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE, error_model="numpy")
 def _bend(fp, s, stamps, flux, score, at, sigma, i, start, out):
     """Subtract from a source's block of H the second derivatives times the score, as they are for a PSF that no pixel blurs.
 
@@ -175,7 +175,7 @@ def _bend(fp, s, stamps, flux, score, at, sigma, i, start, out):
     add_block(i, start, out, fx / flux, fy / flux, xx, xy, yy)
 
 
-@inner(cache=True, error_model="numpy")
+@inner(error_model="numpy")
 def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, background, scale, flux, shift, factors):
     """Fill `flux` and `shift` with their maximum and `factors` with the Cholesky factors of H; add the sources to the image.
 
@@ -266,7 +266,7 @@ def _profile(o, maps, counts, w, fp, boxes, clusters, stamps, sigma, scatter, ba
     return value
 
 
-@nb.njit(cache=True, nogil=True)
+@entry()
 def draw(o, counts, w, theta, nuisances, background, flux, free):
     """Draw all sources, profiling their fluxes if they are free; whoever uses the image clears the workspace.
 
@@ -305,7 +305,7 @@ def draw(o, counts, w, theta, nuisances, background, flux, free):
     return Drawn(extra, maps, Fitted(fp, boxes, clusters, stamps, factors, fluxes, shifts))
 
 
-@nb.njit(cache=True, nogil=True)
+@entry()
 def log_likelihoods(o, counts, w, theta, nuisances, background, flux, free, foretold, turn, out):
     """Log-likelihoods of rows into `out`; rows where it is -inf already are left alone.
 

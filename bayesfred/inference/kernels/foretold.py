@@ -14,11 +14,11 @@ whose templates stay in the caches while they are drawn, weighed and multiplied.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE
 from bayesfred.imaging.kernels.images import add_source
 from bayesfred.imaging.kernels.maps import SEGMENT, footprints, locate, new_maps, new_work, row_starts
 from bayesfred.inference.kernels.clusters import Clusters, bounding_boxes, cholesky, one_cluster, solve
@@ -47,7 +47,7 @@ class Foretold(NamedTuple):
     bend: Floats  # (s,) b
 
 
-@nb.njit(cache=True)
+@entry()
 def describe(fitted, z):
     """`diagonal` to `bend` of `Foretold`, from H's Cholesky factors and z at parameters nearby."""
     clusters, factors, size = fitted.clusters, fitted.factors, fitted.fluxes.size
@@ -80,7 +80,7 @@ def describe(fitted, z):
     return diagonal, first, last, other[:n], place[:n], bend
 
 
-@inner(cache=True, fastmath=FAST, error_model="numpy")
+@inner(fastmath=FAST, error_model="numpy")
 def _weigh_run(values, image, u, step, c0, c1, c2, score, weight):
     """Score n/mu - 1 and weight n/mu^2 of Poisson counts, zero where masked."""
     for i in range(values.size):
@@ -91,7 +91,7 @@ def _weigh_run(values, image, u, step, c0, c1, c2, score, weight):
         weight[i] = n * inverse * inverse
 
 
-@inner(cache=True)
+@inner()
 def _weigh_band(counts, w, background, top, last):
     """Score and weight of a band's marked pixels."""
     ny = w.span.shape[0]
@@ -106,7 +106,7 @@ def _weigh_band(counts, w, background, top, last):
             start, stop = next_run(w.flags, w.span, per_row, j, stop)
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _own_row(templates, i, score, weight, j, n):
     """Sums of template times score and of template squared times weight, n samples from i and j on."""
     g, h = 0.0, 0.0
@@ -116,7 +116,7 @@ def _own_row(templates, i, score, weight, j, n):
     return g, h
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _shared_row(templates, i, m, weight, j, n):
     """Sum of two templates' product times weight, n samples from i, m and j on."""
     total = 0.0
@@ -125,7 +125,7 @@ def _shared_row(templates, i, m, weight, j, n):
     return total
 
 
-@inner(cache=True)
+@inner()
 def _multiply_band(w, fp, boxes, foretold, templates, place, at, top, last, g, h):
     """Add what a band's pixels give to g and H; row i's template is at place[i], its pixels are at at[i]."""
     low, size, score, weight = fp.low, fp.size, w.score, w.weight
@@ -154,7 +154,7 @@ def _multiply_band(w, fp, boxes, foretold, templates, place, at, top, last, g, h
             h[foretold.place[e]] += total
 
 
-@inner(cache=True)
+@inner()
 def _visit(o, counts, w, maps, fp, boxes, at, sigma, background, flux, foretold, templates, g, h):
     """Draw the sources with these fluxes and sum g and H, without the prior's share, over the pixels."""
     place, work = np.empty(fp.row.size, np.int64), new_work(o)
@@ -175,7 +175,7 @@ def _visit(o, counts, w, maps, fp, boxes, at, sigma, background, flux, foretold,
         _multiply_band(w, fp, boxes, foretold, templates, place, at, top, last, g, h)
 
 
-@inner(cache=True)
+@inner()
 def profile_foretold(o, counts, w, theta, nuisances, background, scale, flux, foretold):
     """The log-likelihood; NaN where the fluxes in `flux` are too far from the maximum. Whoever calls clears the workspace."""
     sigma = nuisances[3]

@@ -23,11 +23,10 @@ and d log L/d tau = sum_s [(dx^2 + dy^2 + Q_11 + Q_22 + 2 z_1 dx + 2 z_2 dy)/tau
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import inner
+from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.jacobian import Basis, add_basis_sums, basis_row
 from bayesfred.imaging.kernels.maps import SEGMENT, new_work, row_starts
 from bayesfred.inference.kernels.clusters import add_block, cholesky, draw_template, gram, one_cluster, solve, touch
@@ -45,20 +44,20 @@ class Rows(NamedTuple):
     work: Floats
 
 
-@inner(cache=True)
+@inner()
 def _new_rows(o, basis, width):
     rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
     return Rows(rows, np.empty((9, width)), np.empty((len(o.degree) + 1, width)), new_work(o))
 
 
-@inner(cache=True)
+@inner()
 def _constants():
     """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of a template T."""
     one = np.zeros((1, 2), np.int64)
     return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
 
 
-@inner(cache=True)
+@inner()
 def _weigh(counts, w, background, curve):
     """Score d log L/d mu and weight -d^2 log L/d mu^2 of every marked pixel; curve = -1/2 d weight/d mu."""
     ny = w.span.shape[0]
@@ -82,7 +81,7 @@ def _weigh(counts, w, background, curve):
             start, stop = next_run(w.flags, w.span, per_row, j, stop)
 
 
-@inner(cache=True)
+@inner()
 def _mix(fp, boxes, members, lead, start, lower, stamps, out):
     """The templates q = Q T of a cluster's sources, added to `out`; returns the diagonal of Q."""
     size = stamps.shape[0]
@@ -110,7 +109,7 @@ def _mix(fp, boxes, members, lead, start, lower, stamps, out):
     return diagonal
 
 
-@inner(cache=True)
+@inner()
 def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, i, start, g):
     """What a source's second derivatives K_xx, K_xy, K_yy and X, Y as dK add to its rows of e and G."""
     fp, stamps, flux = drawn.fitted.footprints, drawn.fitted.stamps, drawn.fitted.fluxes[s]
@@ -133,7 +132,7 @@ def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, i, 
             add_block(i, start, g, -r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy[k])
 
 
-@inner(cache=True)
+@inner()
 def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
     """z, the templates q, the image A and the derivative by tau of the module's derivation."""
     fp, boxes, clusters, stamps, factors, flux, shift = drawn.fitted
@@ -188,7 +187,7 @@ def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
     return z, mixed, h, slope
 
 
-@inner(cache=True)
+@inner()
 def _background_gradient(counts, w, background, image, out):
     """Sum of the image times 1, u, v, u^2, uv, v^2 over the likelihood's pixels."""
     ny = w.span.shape[0]
@@ -215,7 +214,7 @@ def _background_gradient(counts, w, background, image, out):
         out[0] += rest / background[0] - pixels if counts.kind == POISSON else (rest - background[0] * pixels) / background[0]
 
 
-@nb.njit(cache=True, nogil=True)
+@entry()
 def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_background):
     """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`.
 

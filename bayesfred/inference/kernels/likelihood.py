@@ -8,11 +8,11 @@ calls; whoever reads it clears it.
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE, inner, log
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.elementary import FAST, REDUCE, log
 from bayesfred.imaging.kernels.maps import SEGMENT, footprints, locate, new_maps
 
 Floats = npt.NDArray[np.float64]
@@ -54,7 +54,7 @@ class Workspace(NamedTuple):
     heap: Floats  # what profiling fills anew on every call, kept because new memory costs more than its use
 
 
-@nb.njit(cache=True)
+@entry()
 def new_workspace(o, nuisances, free):
     """Buffers for one thread; with free fluxes they hold the templates as they are without a distortion and a quarter more."""
     ny, pitch = o.ny, o.ramp.size
@@ -70,13 +70,13 @@ def new_workspace(o, nuisances, free):
     return Workspace(np.zeros(size), np.zeros(size // SEGMENT, np.uint8), span, np.empty(size), np.empty(size), np.empty(room))
 
 
-@inner(cache=True)
+@inner()
 def room(w, first, size):
     """A part of the workspace's heap, or new memory where it is too small."""
     return w.heap[first : first + size] if first + size <= w.heap.size else np.empty(size)
 
 
-@inner(cache=True)
+@inner()
 def mark_sources(fp, w):
     """Mark the segments that the sources' rows of pixels lie in."""
     flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
@@ -96,7 +96,7 @@ def mark_sources(fp, w):
             flags[j * per_row + k] = depth > 0
 
 
-@inner(cache=True)
+@inner()
 def mark_counted(counts, w):
     """Mark every segment with a pixel in the likelihood: a background that varies must be visited everywhere."""
     per_row = w.flags.size // w.span.shape[0]
@@ -108,7 +108,7 @@ def mark_counted(counts, w):
                 w.span[j, 1] = max(w.span[j, 1], k)
 
 
-@inner(cache=True)
+@inner()
 def next_run(flags, span, per_row, j, k):
     """The next marked stretch of row j at or after segment k, as segments [start, stop); start < 0 if there is none."""
     last = span[j, 1]
@@ -123,7 +123,7 @@ def next_run(flags, span, per_row, j, k):
     return start, k
 
 
-@nb.njit(cache=True)
+@entry()
 def clear(w):
     """Make a workspace's image zero again."""
     per_row = w.flags.size // w.span.shape[0]
@@ -137,7 +137,7 @@ def clear(w):
             w.span[j, 1] = -1
 
 
-@inner(cache=True)
+@inner()
 def background_row(background, j, ny):
     """Coefficients of the background polynomial on row j in powers of u; u, v run from -1 to 1 over the frame."""
     v = (2 * j - ny + 1) / ny
@@ -145,7 +145,7 @@ def background_row(background, j, ny):
     return c0, background[1] + v * background[4], background[3]
 
 
-@inner(cache=True, fastmath=FAST)
+@inner(fastmath=FAST)
 def _slope_run(image, u, step, c1, c2, out):
     """The image of a stretch plus the part of the background that varies along it."""
     for i in range(image.size):
@@ -153,7 +153,7 @@ def _slope_run(image, u, step, c1, c2, out):
         out[i] = image[i] + x * (c1 + x * c2)
 
 
-@inner(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE, error_model="numpy")
 def _poisson_run(image, values, level):
     """Sum of n log(mu) - mu over the unmasked pixels of a stretch; MASKED or less if one of these has no positive mu."""
     total = 0.0
@@ -165,7 +165,7 @@ def _poisson_run(image, values, level):
     return total
 
 
-@inner(cache=True, fastmath=REDUCE)
+@inner(fastmath=REDUCE)
 def _sum(values):
     total = 0.0
     for i in range(values.size):
@@ -173,7 +173,7 @@ def _sum(values):
     return total
 
 
-@inner(cache=True, fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE, error_model="numpy")
 def _square_run(image, values, level):
     """Sum of (n - mu)^2 over the unmasked pixels of a stretch."""
     total = 0.0
@@ -183,7 +183,7 @@ def _square_run(image, values, level):
     return total
 
 
-@inner(cache=True)
+@inner()
 def log_likelihood(counts, w, background):
     """Log-likelihood of the workspace's image plus the background; what depends on the counts alone is left out."""
     ny = w.span.shape[0]
