@@ -1,21 +1,21 @@
-from . import runs
+from . import commands
 from .analysis.comparison import Comparison, compare
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.noise_study import NoiseStudy, noise_study
 from .analysis.sbc import PosteriorCalibration, calibrate_posterior
-from .analysis.study import NoiseStudy, noise_study
 from .errors import InputError
+from .imaging.catalog import SourceCatalog
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
 from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
-from .imaging.scene import SourceCatalog
-from .inference.chainfile import Chain, open_chain
-from .inference.estimate import MapEstimate, find_map, sigma_clip
-from .inference.moves import LaplaceMove
-from .inference.noise import BackgroundNoise, PoissonNoise, simulate
-from .inference.posterior import Nuisances, Posterior
-from .inference.sampling import sample
+from .model.noise import BackgroundNoise, PoissonNoise, simulate
+from .model.posterior import Nuisances, Posterior
+from .optimize.find_map import MapEstimate, find_map, reject_outliers
+from .sampling.chainfile import Chain, open_chain
+from .sampling.moves import LaplaceMove
+from .sampling.sampler import sample
 
 __all__ = [
     "BackgroundNoise",
@@ -39,15 +39,15 @@ __all__ = [
     "SampledPSF",
     "SourceCatalog",
     "calibrate_posterior",
+    "commands",
     "compare",
     "correct_sampling",
     "diagnose",
     "find_map",
     "noise_study",
     "open_chain",
-    "runs",
+    "reject_outliers",
     "sample",
     "sampling_matrix",
-    "sigma_clip",
     "simulate",
 ]

@@ -1,7 +1,7 @@
 """The command line: options in, exit codes out. What a command does is in `runs.py`.
 
-Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, verified or calibrated, 130 interrupted, or
-terminated, with everything saved.
+Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, verified or
+calibrated, 130 interrupted, or terminated, with everything saved.
 """
 
 import signal
@@ -27,7 +27,9 @@ app = typer.Typer(
 )
 
 Run = Annotated[Path, typer.Argument(metavar="RUN.toml", help="The run file.", show_default=False)]
-ChainFile = Annotated[Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)]
+ChainFile = Annotated[
+    Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the output file.")]
 
@@ -40,24 +42,30 @@ def _example() -> str:
 
 @app.command()
 def demo(
-    folder: Annotated[Path, typer.Option(help="Where demo.h5, demo.html and demo.png go.")] = Path("chains"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated frame and of the sampler.")] = 1,
+    folder: Annotated[Path, typer.Option(help="Where demo.h5, demo.html and demo.png go.")] = Path(
+        "chains"
+    ),
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the simulated frame and of the sampler.")
+    ] = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 coefficients, Poisson counts."""
-    _run(lambda: bf.runs.demo(folder, seed=seed, overwrite=overwrite).diagnostics.converged)
+    _run(lambda: bf.commands.demo(folder, seed=seed, overwrite=overwrite).diagnostics.converged)
 
 
 @app.command()
 def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
     """Draw the frame that [simulation] describes into [frame] path, and its source grid, if any, into [catalogue] path."""
-    _run(lambda: bf.runs.simulate_frame(run_file, overwrite=overwrite))
+    _run(lambda: bf.commands.simulate_frame(run_file, overwrite=overwrite))
 
 
 @app.command(epilog="A complete run file:\n\n" + _example())
 def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
-    _run(lambda: bf.runs.fit(run_file, resume=resume, overwrite=overwrite).diagnostics.converged)
+    _run(
+        lambda: bf.commands.fit(run_file, resume=resume, overwrite=overwrite).diagnostics.converged
+    )
 
 
 class Kind(StrEnum):
@@ -71,17 +79,30 @@ class Kind(StrEnum):
 def study(
     run_file: Run,
     kind: Annotated[
-        Kind | None, typer.Option(help="Noise levels, or simulation-based calibration.", show_default="the run file's")
+        Kind | None,
+        typer.Option(
+            help="Noise levels, or simulation-based calibration.", show_default="the run file's"
+        ),
     ] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster in place of a pool.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes of the pool.", show_default="one a core")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster in place of a pool."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes of the pool.", show_default="one a core")
+    ] = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Fit many simulated frames: how well a distortion can be known, and whether error bars hold."""
     _run(
-        lambda: bf.runs.study(
-            run_file, kind=kind and kind.value, scheduler=scheduler, workers=workers, resume=resume, overwrite=overwrite
+        lambda: bf.commands.study(
+            run_file,
+            kind=kind and kind.value,
+            scheduler=scheduler,
+            workers=workers,
+            resume=resume,
+            overwrite=overwrite,
         )
     )
 
@@ -90,28 +111,36 @@ def study(
 def report(
     chain_file: ChainFile,
     target_ess: Annotated[
-        float | None, typer.Option(min=1, help="Effective draws to ask of every parameter.", show_default="the run's")
+        float | None,
+        typer.Option(
+            min=1, help="Effective draws to ask of every parameter.", show_default="the run's"
+        ),
     ] = None,
 ) -> None:
     """Judge a chain file anew and write its report, .html and .png, beside it."""
-    _run(lambda: bf.runs.report(chain_file, target_ess=target_ess).diagnostics.converged)
+    _run(lambda: bf.commands.report(chain_file, target_ess=target_ess).diagnostics.converged)
 
 
 @app.command()
 def compare(
-    chain_files: Annotated[list[Path], typer.Argument(metavar="A.h5 B.h5 ...", help="Chains of one frame.", show_default=False)],
+    chain_files: Annotated[
+        list[Path],
+        typer.Argument(metavar="A.h5 B.h5 ...", help="Chains of one frame.", show_default=False),
+    ],
 ) -> None:
     """Rank models of one frame by how well they predict every pixel from the others."""
-    _run(lambda: bf.runs.compare(chain_files).reliable)
+    _run(lambda: bf.commands.compare(chain_files).reliable)
 
 
 @app.command()
 def verify(
     chain_file: ChainFile,
-    every_draw: Annotated[bool, typer.Option("--all", help="Every draw's log-probability, not 1,000 of them.")] = False,
+    every_draw: Annotated[
+        bool, typer.Option("--all", help="Every draw's log-probability, not 1,000 of them.")
+    ] = False,
 ) -> None:
     """Compute again what a chain file holds: hashes, log-probabilities, the maximum, the first steps from the seed."""
-    _run(lambda: bf.runs.verify(chain_file, every_draw=every_draw))
+    _run(lambda: bf.commands.verify(chain_file, every_draw=every_draw))
 
 
 def _run(work: "Callable[[], bool | None]") -> None:
@@ -123,7 +152,11 @@ def _run(work: "Callable[[], bool | None]") -> None:
         typer.echo(f"bayesfred: {error}", err=True)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
-        typer.echo("bayesfred: interrupted; what a run has sampled or a study has finished is saved: go on with --resume", err=True)
+        typer.echo(
+            "bayesfred: interrupted; what a run has sampled or a study has finished is saved: go "
+            "on with --resume",
+            err=True,
+        )
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGTERM, before)

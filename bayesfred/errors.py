@@ -9,7 +9,9 @@ def printable(text: str) -> str:
     >>> print(printable("two\nlines\x1b[31m"))
     two\nlines\x1b[31m
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
+    )
 
 
 class InputError(ValueError):

@@ -1,10 +1,10 @@
 """The run file: one TOML file that says what a run fits, to what, and how.
 
-Each section is a frozen model with the keys, units and defaults of the run file; :func:`read_settings` checks
-all of them at once and says every mistake in one line. Settings know only plain values: the command line
-turns them into a model, `model_dump_json` turns them into the text that result files keep, and
-:func:`resolve` finds the files they name. `example.toml` beside this module is a complete run file. Frames and
-catalogues are read in `bayesfred.files`.
+Each section is a frozen model with the keys, units and defaults of the run file;
+:func:`read_settings` checks all of them at once and says every mistake in one line. Settings know
+only plain values: the command line turns them into a model, `model_dump_json` turns them into the
+text that result files keep, and :func:`resolve` finds the files they name. `example.toml` beside
+this module is a complete run file. Frames and catalogues are read in `bayesfred.io.files`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class _Section(BaseModel):
 
 
 class FrameSettings(_Section):
-    """`[frame]`: the frame of counts, as `bayesfred.files.read_frame` takes it.
+    """`[frame]`: the frame of counts, as `bayesfred.io.files.read_frame` takes it.
 
     Attributes
     ----------
@@ -61,8 +61,9 @@ class FrameSettings(_Section):
         Pixels at or above this level are masked.
     name : str, optional
         FITS extension or HDF5 dataset.
-    sigma_clip : bool
-        Whether spots of no source, and sources without a spot, are left out: `bayesfred.sigma_clip`.
+    reject_outliers : bool
+        Whether spots of no source, and sources without a spot, are left out:
+        `bayesfred.reject_outliers`.
     """
 
     path: _Name
@@ -70,11 +71,11 @@ class FrameSettings(_Section):
     pedestal: _Float = 0.0
     saturation: _Float | None = None
     name: _Name | None = None
-    sigma_clip: bool = False
+    reject_outliers: bool = False
 
 
 class CatalogueSettings(_Section):
-    """`[catalogue]`: the known sources, as `bayesfred.files.read_catalogue` takes them.
+    """`[catalogue]`: the known sources, as `bayesfred.io.files.read_catalogue` takes them.
 
     Attributes
     ----------
@@ -134,7 +135,8 @@ class PSFSettings(_Section):
     beta : float
         Exponent of its wings.
     path : str
-        Of a sampled PSF: file of its samples, an image such as a frame's, its sides odd numbers of pixels.
+        Of a sampled PSF: file of its samples, an image such as a frame's, its sides odd numbers of
+        pixels.
     oversampling : float
         Samples per pixel.
     """
@@ -148,10 +150,21 @@ class PSFSettings(_Section):
 
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> PSFSettings:
-        wanted = {"gaussian": ["sigma"], "moffat": ["fwhm", "beta"], "sampled": ["path", "oversampling"]}[self.kind]
-        given = [key for key in ("sigma", "fwhm", "beta", "path", "oversampling") if getattr(self, key) is not None]
+        wanted = {
+            "gaussian": ["sigma"],
+            "moffat": ["fwhm", "beta"],
+            "sampled": ["path", "oversampling"],
+        }[self.kind]
+        given = [
+            key
+            for key in ("sigma", "fwhm", "beta", "path", "oversampling")
+            if getattr(self, key) is not None
+        ]
         if given != wanted:
-            raise ValueError(f"got {' and '.join(given) or 'no width'}, expected {' and '.join(wanted)} with kind = '{self.kind}'")
+            raise ValueError(
+                f"got {' and '.join(given) or 'no width'}, expected {' and '.join(wanted)} with "
+                f"kind = '{self.kind}'"
+            )
         return self
 
 
@@ -160,15 +173,15 @@ class DistortionSettings(_Section):
 
     Attributes
     ----------
-    terms : {'mirrored', 'paper', 'pinhole', 'complete'}, optional
+    terms : {'mirrored', 'paper', 'pinhole', 'full_polynomial'}, optional
         A basis by name.
     degree : int, optional
-        Highest total degree of the 'complete' basis.
+        Highest total degree of the 'full_polynomial' basis.
     f_terms, g_terms : tuple of (i, j, m, n), optional
         Powers of x, y, u, v, one entry a term.
     """
 
-    terms: Literal["mirrored", "paper", "pinhole", "complete"] | None = None
+    terms: Literal["mirrored", "paper", "pinhole", "full_polynomial"] | None = None
     degree: Annotated[int, Field(ge=2, le=10)] | None = None
     f_terms: tuple[_Term, ...] | None = None
     g_terms: tuple[_Term, ...] | None = None
@@ -179,10 +192,12 @@ class DistortionSettings(_Section):
         if given not in (["terms"], ["f_terms", "g_terms"]):
             got = " and ".join(given) or "no terms"
             raise ValueError(f"got {got}, expected either terms, or both f_terms and g_terms")
-        if self.terms == "complete" and self.degree is None:
-            raise ValueError("got no degree, expected one with terms = 'complete'")
-        if self.terms != "complete" and self.degree is not None:
-            raise ValueError(f"got degree {self.degree}, expected it with terms = 'complete' only")
+        if self.terms == "full_polynomial" and self.degree is None:
+            raise ValueError("got no degree, expected one with terms = 'full_polynomial'")
+        if self.terms != "full_polynomial" and self.degree is not None:
+            raise ValueError(
+                f"got degree {self.degree}, expected it with terms = 'full_polynomial' only"
+            )
         if not self.terms and not self.f_terms and not self.g_terms:
             raise ValueError("got f_terms and g_terms empty, expected at least one term")
         return self
@@ -220,7 +235,9 @@ class NoiseSettings(_Section):
     @model_validator(mode="after")
     def _read_noise_is_poisson(self) -> NoiseSettings:
         if self.kind == "background" and self.read_noise > 0:
-            raise ValueError(f"got read_noise {self.read_noise}, expected it with kind = 'poisson' only")
+            raise ValueError(
+                f"got read_noise {self.read_noise}, expected it with kind = 'poisson' only"
+            )
         return self
 
 
@@ -234,13 +251,15 @@ class NuisanceSettings(_Section):
     offset : bool
         Whether a common shift of all sources is fitted.
     psf_sigma : bool
-        Whether the PSF's width is fitted, whatever its kind: that of the Gaussian as wide at half maximum.
+        Whether the PSF's width is fitted, whatever its kind: that of the Gaussian as wide at half
+        maximum.
     background_order : {0, 1, 2}
         Order of the background's polynomial over the frame.
     footprint : float, optional, pixel
         Keep only pixels this near to a catalogued source.
     position_scatter : bool
-        Whether sources lie off their catalogue positions, by errors of unknown standard deviation; with free fluxes.
+        Whether sources lie off their catalogue positions, by errors of unknown standard deviation;
+        with free fluxes.
     """
 
     flux: Literal["fixed", "scale", "free"] = "fixed"
@@ -257,7 +276,8 @@ class PriorSettings(_Section):
     Attributes
     ----------
     distribution : str
-        Its name, such as 'norm'. Every other key of the table is one of its keyword parameters, a float.
+        Its name, such as 'norm'. Every other key of the table is one of its keyword parameters, a
+        float.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -355,11 +375,13 @@ class StudySettings(_Section):
     Attributes
     ----------
     kind : {'noise', 'sbc'}
-        Fits of the truth of [simulation] at several noise levels, or simulation-based calibration: truths from the priors.
+        Fits of the truth of [simulation] at several noise levels, or simulation-based calibration:
+        truths from the priors.
     replicates : int
         Frames of every noise level, or of the calibration.
     method : {'laplace', 'mcmc'}, optional
-        The maximum with its Fisher information, or draws; by default the first for 'noise', the second for 'sbc'.
+        The maximum with its Fisher information, or draws; by default the first for 'noise', the
+        second for 'sbc'.
     seed : int
         Seed of every random number.
     background : tuple of float, optional, counts per pixel
@@ -435,8 +457,8 @@ def read_settings(path: str | Path) -> RunSettings:
     Raises
     ------
     InputError
-        The file is missing or is not TOML; a key is unknown, missing or has a value out of range. All
-        mistakes are named in the one line.
+        The file is missing or is not TOML; a key is unknown, missing or has a value out of range.
+        All mistakes are named in the one line.
 
     Examples
     --------
@@ -451,21 +473,29 @@ def read_settings(path: str | Path) -> RunSettings:
     try:
         # A byte order mark, which some editors write, is not TOML.
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        # JSON is what result files keep, so a run file is checked by the rules it will be read back with. Dates, which
-        # only TOML has, are no key's type.
-        return RunSettings.model_validate_json(json.dumps(table, default=lambda date: {str(date): "date"}))
+        # JSON is what result files keep, so a run file is checked by the rules it will be read back
+        # with. Dates, which only TOML has, are no key's type.
+        return RunSettings.model_validate_json(
+            json.dumps(table, default=lambda date: {str(date): "date"})
+        )
     except FileNotFoundError:
         raise InputError(f"{path}: no such file, expected a run file; check the path") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}), expected a run file") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}), expected a run file"
+        ) from error
     except RecursionError:
         raise InputError(f"{path}: {_TOO_DEEP}") from None
     except ValidationError as error:
         mistakes = "; ".join(_mistake(details) for details in error.errors(include_url=False))
         raise InputError(" ".join(f"{path}: {mistakes}".split())) from None
-    except ValueError as error:  # TOML syntax (its text gives line and column) and text that is not UTF-8
+    except (
+        ValueError
+    ) as error:  # TOML syntax (its text gives line and column) and text that is not UTF-8
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not TOML ({reason}), expected sections of key = value") from error
+        raise InputError(
+            f"{path}: not TOML ({reason}), expected sections of key = value"
+        ) from error
 
 
 def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False) -> Path:
@@ -474,8 +504,8 @@ def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False)
     Parameters
     ----------
     path : str or Path
-        As the run file gives it. An absolute path stays; a relative one is looked up beside the run file,
-        then in the folder that the environment variable BAYESFRED_DATA names.
+        As the run file gives it. An absolute path stays; a relative one is looked up beside the run
+        file, then in the folder that the environment variable BAYESFRED_DATA names.
     run_file : str or Path
         The run file.
     must_exist : bool
@@ -500,7 +530,9 @@ def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False)
     places = [Path(run_file).parent / path]
     if folder and not Path(path).is_absolute():
         places.append(Path(folder) / path)
-    found = next((place for place in places if os.path.exists(place)), None)  # unlike Path.exists, whatever the path
+    found = next(
+        (place for place in places if os.path.exists(place)), None
+    )  # unlike Path.exists, whatever the path
     if found is None and must_exist:
         remedy = "check the path"
         if not Path(path).is_absolute():
@@ -529,13 +561,14 @@ def within(folder: str | Path, path: str | Path, where: str) -> Path:
     Raises
     ------
     InputError
-        The path leads out of the folder, by being absolute, by .. or through links, or it is no path.
+        The path leads out of the folder, by being absolute, by .. or through links, or it is no
+        path.
 
     Examples
     --------
-    >>> within("runs", "night/one.h5", "run.toml: output.path").as_posix()
+    >>> within("commands", "night/one.h5", "run.toml: output.path").as_posix()
     'runs/night/one.h5'
-    >>> within("runs", "../one.h5", "run.toml: output.path")
+    >>> within("commands", "../one.h5", "run.toml: output.path")
     Traceback (most recent call last):
     ...
     bayesfred.errors.InputError: run.toml: output.path: got '../one.h5', which leads out of ..., expected a path that stays inside
@@ -545,7 +578,9 @@ def within(folder: str | Path, path: str | Path, where: str) -> Path:
     try:
         inside = place.resolve().is_relative_to(Path(folder).resolve())
         os.stat(place)
-    except OSError as error:  # from Python 3.13 on `resolve` does not mind a loop of links; other faults show when it is opened
+    # from Python 3.13 on `resolve` does not mind a loop of links; other faults show when it is
+    # opened
+    except OSError as error:
         inside = inside and error.errno != errno.ELOOP
     except (RuntimeError, ValueError):  # a loop of links, a zero byte
         pass

@@ -1,9 +1,11 @@
 """How fast the package is: `python -m benchmarks` prints measure, ratio, bound and whether it is met.
 
-Every row is a ratio within one run, of times the median of interleaved repetitions, so that it says something about the code
-and little about the machine. The problem is the paper's frame: 505 x 505 pixels, 81 sources, sigma 10, tolerance 1e-8.
-`--full` adds how the cost grows with degree, PSF, pixel response, frame and sources, and the memory, what others reach on the same
-posterior (`benchmarks.peers`), and a large frame (`benchmarks.large`); rows without a bound are there to be known.
+Every row is a ratio within one run, of times the median of interleaved repetitions, so that it says
+something about the code and little about the machine. The problem is the paper's frame: 505 x 505
+pixels, 81 sources, sigma 10, tolerance 1e-8. `--full` adds how the cost grows with degree, PSF,
+pixel response, frame and sources, and the memory, what others reach on the same posterior
+(`benchmarks.peers`), and a large frame (`benchmarks.large`); rows without a bound are there to be
+known.
 """
 
 import subprocess
@@ -19,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import bayesfred as bf
-from bayesfred.inference import sampling
+from bayesfred.model import sampling
 
 THETA = np.array([0.0, 2e-6, 0.0, -2e-6, 1e-6, 2e-6, 0.0, 3e-6, 0.0, 1e-6, 1e-6, -1e-6])
 SAMPLES = 960_000  # kernel samples of the paper's frame at this tolerance
@@ -27,11 +29,16 @@ SAMPLES = 960_000  # kernel samples of the paper's frame at this tolerance
 
 def model(shape: tuple[int, int] = (505, 505), spacing: float = 50.0) -> bf.ForwardModel:
     sources = bf.SourceCatalog.grid(9, spacing, 1e5)
-    return bf.ForwardModel(bf.Detector(shape), sources, bf.GaussianPSF(10.0), bf.PolynomialDistortion.mirrored())
+    return bf.ForwardModel(
+        bf.Detector(shape), sources, bf.GaussianPSF(10.0), bf.PolynomialDistortion.mirrored()
+    )
 
 
 def ratio(
-    work: Callable[[], object], unit: Callable[[], object], repetitions: int, clock: Callable[[], float] = time.thread_time
+    work: Callable[[], object],
+    unit: Callable[[], object],
+    repetitions: int,
+    clock: Callable[[], float] = time.thread_time,
 ) -> float:
     """Median time of `work` over that of `unit`, run in turn; the processor's time of this thread unless told otherwise."""
     work(), unit()
@@ -102,29 +109,46 @@ print((peak() - before) / frame.nbytes)
 """
 
 
-def growth(exp: Callable[[], object], posterior: bf.Posterior, truth: np.ndarray) -> list[tuple[str, float, float | None]]:
+def growth(
+    exp: Callable[[], object], posterior: bf.Posterior, truth: np.ndarray
+) -> list[tuple[str, float, float | None]]:
     """The rows of `--full`."""
     m = posterior.model
 
-    def image(shape: tuple[int, int], side: int, spacing: float, **detector: str) -> Callable[[], object]:
+    def image(
+        shape: tuple[int, int], side: int, spacing: float, **detector: str
+    ) -> Callable[[], object]:
         camera, sources = bf.Detector(shape, **detector), bf.SourceCatalog.grid(side, spacing, 1e5)
         grown = bf.ForwardModel(camera, sources, m.psf, m.distortion)
         return lambda: grown.expected_counts(np.zeros(12))
 
     rows: list[tuple[str, float, float | None]] = []
     for degree in (2, 3, 4, 5):
-        terms = bf.PolynomialDistortion.complete(degree)
+        terms = bf.PolynomialDistortion.full_polynomial(degree)
         deep = bf.ForwardModel(m.detector, m.sources, m.psf, terms)
         value = ratio(lambda deep=deep, n=terms.n_terms: deep.expected_counts(np.zeros(n)), exp, 20)
         rows.append((f"expected counts, every term to degree {degree} / np.exp", value, None))
     plain, x, moffat = np.zeros(12), np.arange(-240, 241) / 4.0, bf.MoffatPSF(23.5, 3.0)
     sampled = bf.SampledPSF(m.psf.density(x, x[:, None]), 4)
-    for name, psf, tolerance in (("Moffat", moffat, float(moffat.density(60.7, 0.0) / moffat.peak)), ("sampled", sampled, 1e-8)):
-        other = bf.ForwardModel(m.detector, m.sources, psf, m.distortion, tolerance=tolerance)  # windows as the Gaussian's
-        value = ratio(lambda other=other: other.expected_counts(plain), lambda: m.expected_counts(plain), 20)
+    for name, psf, tolerance in (
+        ("Moffat", moffat, float(moffat.density(60.7, 0.0) / moffat.peak)),
+        ("sampled", sampled, 1e-8),
+    ):
+        other = bf.ForwardModel(
+            m.detector, m.sources, psf, m.distortion, tolerance=tolerance
+        )  # windows as the Gaussian's
+        value = ratio(
+            lambda other=other: other.expected_counts(plain), lambda: m.expected_counts(plain), 20
+        )
         rows.append((f"expected counts, {name} PSF / Gaussian", value, None))
     impulse = image((505, 505), 9, 50.0)
-    rows.append(("box pixels / impulse pixels", ratio(image((505, 505), 9, 50.0, pixel="box"), impulse, 10), None))
+    rows.append(
+        (
+            "box pixels / impulse pixels",
+            ratio(image((505, 505), 9, 50.0, pixel="box"), impulse, 10),
+            None,
+        )
+    )
     few = image((505, 505), 9, 40.0)  # every source's pixels are within the frame, here and below
     for n, side, repetitions in ((1365, 32, 10), (4096, 100, 5)):
         value = ratio(image((n, n), side, 40.0), few, repetitions) * 81 / side**2
@@ -133,10 +157,15 @@ def growth(exp: Callable[[], object], posterior: bf.Posterior, truth: np.ndarray
     best = bf.find_map(free, truth)
     walkers = np.random.default_rng(1).multivariate_normal(best.params, best.covariance, 16)
     fixed = with_threads(1, lambda: posterior.log_prob(walkers))
-    for name, kind, bound in (("as sampled", free.near(best.params, best.covariance), 2.0), ("anywhere", free, None)):
+    for name, kind, bound in (
+        ("as sampled", free.near(best.params, best.covariance), 2.0),
+        ("anywhere", free, None),
+    ):
         value = ratio(with_threads(1, lambda kind=kind: kind.log_prob(walkers)), fixed, 10)
         rows.append((f"log-posterior, free fluxes {name} / fixed", value, bound))
-    peak = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True, check=True).stdout
+    peak = subprocess.run(
+        [sys.executable, "-c", MEMORY], capture_output=True, text=True, check=True
+    ).stdout
     rows.append(("peak memory of an image / the frame's bytes", float(peak), 4.0))
     return rows
 
@@ -152,10 +181,15 @@ def main() -> int:
         return np.exp(x, out=out)
 
     # the same sources in four times the empty frame, their pixels within the smaller one too
-    inner, outer = (bf.Posterior(e, bf.simulate(e, THETA, 5.0, seed=1)) for e in (model(spacing=40.0), model((1010, 1010), 40.0)))
+    inner, outer = (
+        bf.Posterior(e, bf.simulate(e, THETA, 5.0, seed=1))
+        for e in (model(spacing=40.0), model((1010, 1010), 40.0))
+    )
     many = model((505, 1010))
     doubled = bf.SourceCatalog(
-        np.concatenate([m.sources.x - 252.0, m.sources.x + 252.0]), np.tile(m.sources.y, 2), np.tile(m.sources.flux, 2)
+        np.concatenate([m.sources.x - 252.0, m.sources.x + 252.0]),
+        np.tile(m.sources.y, 2),
+        np.tile(m.sources.flux, 2),
     )
     plain = np.zeros(12)
     twice = bf.ForwardModel(many.detector, doubled, m.psf, m.distortion)
@@ -168,7 +202,15 @@ def main() -> int:
 
     def sample(estimate: bf.MapEstimate | None = None, steps: int | None = None) -> bf.Chain:
         path = Path(folder.name) / "chain.h5"
-        return bf.sample(posterior, estimate or fit(), path=path, seed=1, steps=steps, overwrite=True, progress=False)
+        return bf.sample(
+            posterior,
+            estimate or fit(),
+            path=path,
+            seed=1,
+            steps=steps,
+            overwrite=True,
+            progress=False,
+        )
 
     estimate = fit()
     # so many steps that neither burn-in nor the noise of the least of 26 numbers counts
@@ -178,8 +220,16 @@ def main() -> int:
     draws = float(np.prod(chain.chain.shape[:3]))
     one = with_threads(1, exp)
     rows: list[tuple[str, float, float | None]] = [
-        ("expected counts / np.exp of as many samples", ratio(lambda: m.expected_counts(THETA, 5.0), exp, 40), 1.5),
-        ("log-posterior per walker / np.exp", ratio(with_threads(1, lambda: posterior.log_prob(truth)), one, 40), 2.2),
+        (
+            "expected counts / np.exp of as many samples",
+            ratio(lambda: m.expected_counts(THETA, 5.0), exp, 40),
+            1.5,
+        ),
+        (
+            "log-posterior per walker / np.exp",
+            ratio(with_threads(1, lambda: posterior.log_prob(truth)), one, 40),
+            2.2,
+        ),
         (
             "32 walkers, 2 threads / 1 thread",
             ratio(
@@ -190,8 +240,16 @@ def main() -> int:
             ),
             0.6,
         ),
-        ("Fisher information / np.exp", ratio(with_threads(1, lambda: posterior.fisher(truth)), one, 10), 25.0),
-        ("MAP from a cold start / np.exp", ratio(with_threads(2, fit), exp, 3, time.perf_counter), 500.0),
+        (
+            "Fisher information / np.exp",
+            ratio(with_threads(1, lambda: posterior.fisher(truth)), one, 10),
+            25.0,
+        ),
+        (
+            "MAP from a cold start / np.exp",
+            ratio(with_threads(2, fit), exp, 3, time.perf_counter),
+            500.0,
+        ),
         ("likelihoods per effective draw", draws / least, 1.3),
         (
             "MAP and 1,000 effective draws / one dense NumPy image",
@@ -199,13 +257,24 @@ def main() -> int:
             3.0,
         ),
         ("saving / sampling, 150 steps", saving, 0.01),
-        ("twice the sources", ratio(lambda: twice.expected_counts(plain), lambda: once.expected_counts(plain), 20), 2.1),
-        ("four times the empty frame", ratio(lambda: outer.log_prob(truth), lambda: inner.log_prob(truth), 20), 1.1),
+        (
+            "twice the sources",
+            ratio(lambda: twice.expected_counts(plain), lambda: once.expected_counts(plain), 20),
+            2.1,
+        ),
+        (
+            "four times the empty frame",
+            ratio(lambda: outer.log_prob(truth), lambda: inner.log_prob(truth), 20),
+            1.1,
+        ),
     ]
     folder.cleanup()
     if "--full" in sys.argv[1:]:
         rows += growth(one, posterior, truth)
-    table = Table(title=f"{estimate.n_evaluations} likelihoods to the maximum, {draws:.0f} for {least:.0f} effective draws")
+    table = Table(
+        title=f"{estimate.n_evaluations} likelihoods to the maximum, {draws:.0f} for {least:.0f} "
+        "effective draws"
+    )
     for head in ("measure", "ratio", "bound", "met"):
         table.add_column(head, justify="left" if head == "measure" else "right")
     for name, value, bound in rows:
@@ -216,7 +285,10 @@ def main() -> int:
     if "--full" in sys.argv[1:]:  # programs of their own, for their memory's sake
         for name in ("peers", "large"):
             sys.stdout.flush()
-            met &= subprocess.run([sys.executable, "-m", f"benchmarks.{name}"], check=False).returncode == 0
+            met &= (
+                subprocess.run([sys.executable, "-m", f"benchmarks.{name}"], check=False).returncode
+                == 0
+            )
     return 0 if met else 1
 
 

@@ -1,7 +1,8 @@
 """A large frame: 4096 x 4096 pixels, 10,000 sources of sigma 1.5, 30 parameters, two cores; `python -m benchmarks.large`.
 
-The parameters are the 28 coefficients of every term to degree 3 with f in x, y, u and g in x, y, v, the background and a common
-flux factor. Printed are the seconds to the maximum and to 1,000 effective draws, what they go into, and the peak memory.
+The parameters are the 28 coefficients of every term to degree 3 with f in x, y, u and g in x, y, v,
+the background and a common flux factor. Printed are the seconds to the maximum and to 1,000
+effective draws, what they go into, and the peak memory.
 """
 
 import re
@@ -18,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import bayesfred as bf
-from bayesfred.inference import estimate, sampling
+from bayesfred.model import estimate, sampling
 
 MEMORY = 4.0  # GiB
 
@@ -55,14 +56,22 @@ def peak() -> float:
 
 
 def problem() -> bf.Posterior:
-    terms = bf.PolynomialDistortion.complete(3)
-    distortion = bf.PolynomialDistortion([t for t in terms.f_terms if t[3] == 0], [t for t in terms.g_terms if t[2] == 0])
+    terms = bf.PolynomialDistortion.full_polynomial(3)
+    distortion = bf.PolynomialDistortion(
+        [t for t in terms.f_terms if t[3] == 0], [t for t in terms.g_terms if t[2] == 0]
+    )
     sources = bf.SourceCatalog.grid(100, 40.0, 2e3)
     model = bf.ForwardModel(bf.Detector((4096, 4096)), sources, bf.GaussianPSF(1.5), distortion)
     half = 2048.0
-    levers = np.array([half ** (1 - sum(term)) for term in (*distortion.f_terms, *distortion.g_terms)])
-    theta = 0.002 * levers * np.random.default_rng(1).standard_normal(levers.size)  # every term moves a corner by some 4 pixels
-    return bf.Posterior(model, bf.simulate(model, theta, 5.0, seed=1), nuisances=bf.Nuisances(flux="scale"))
+    levers = np.array(
+        [half ** (1 - sum(term)) for term in (*distortion.f_terms, *distortion.g_terms)]
+    )
+    theta = (
+        0.002 * levers * np.random.default_rng(1).standard_normal(levers.size)
+    )  # every term moves a corner by some 4 pixels
+    return bf.Posterior(
+        model, bf.simulate(model, theta, 5.0, seed=1), nuisances=bf.Nuisances(flux="scale")
+    )
 
 
 def kernel_share(posterior: bf.Posterior, params: np.ndarray) -> float:
@@ -83,7 +92,10 @@ def kernel_share(posterior: bf.Posterior, params: np.ndarray) -> float:
 def main() -> int:
     numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
     posterior = problem()
-    posterior.gradient(posterior.start()), posterior.fisher(posterior.start())  # compiled code is loaded
+    (
+        posterior.gradient(posterior.start()),
+        posterior.fisher(posterior.start()),
+    )  # compiled code is loaded
     split = Split()
     split.watch(bf.Posterior, "unchecked_log_prob", "likelihoods")
     split.watch(bf.Posterior, "gradient", "gradients")
@@ -97,7 +109,9 @@ def main() -> int:
     to_map = sum(split.spent.values())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "chain.h5"
-        chain = split.run("emcee, proposals, rest", bf.sample, posterior, top, path=path, seed=1, progress=False)
+        chain = split.run(
+            "emcee, proposals, rest", bf.sample, posterior, top, path=path, seed=1, progress=False
+        )
         size = path.stat().st_size / 2**20
         verdict, memory = bf.diagnose(chain), peak()
     share = kernel_share(posterior, top.params)
@@ -110,12 +124,15 @@ def main() -> int:
     for part, spent in sorted(split.spent.items(), key=lambda item: -item[1]):
         table.add_row(part, f"{spent:.1f}", f"{spent / whole:.0%}")
         if part == "likelihoods":
-            table.add_row("  of these the kernel", f"{share * spent:.1f}", f"{share * spent / whole:.0%}")
+            table.add_row(
+                "  of these the kernel", f"{share * spent:.1f}", f"{share * spent / whole:.0%}"
+            )
     console = Console(width=None if sys.stdout.isatty() else 110)
     console.print(table)
     console.print(verdict.message)
     console.print(
-        f"peak memory {memory:.1f} GiB of {MEMORY:.0f}, frame {posterior.counts.nbytes / 2**30:.2f}; chain file {size:.0f} MiB"
+        f"peak memory {memory:.1f} GiB of {MEMORY:.0f}, frame "
+        f"{posterior.counts.nbytes / 2**30:.2f}; chain file {size:.0f} MiB"
     )
     return 0 if top.converged and verdict.converged and memory <= MEMORY else 1
 

@@ -1,17 +1,19 @@
 """What others reach on the same posterior: the paper's frame, 13 parameters, Poisson counts; `python -m benchmarks.peers`.
 
-Each peer is written as a careful user of that package would, in float64, vectorised and compiled, evaluating every source
-on a stamp of the pixels where it exceeds 1e-8 of its peak:
+Each peer is written as a careful user of that package would, in float64, vectorised and compiled,
+evaluating every source on a stamp of the pixels where it exceeds 1e-8 of its peak:
 
 - emcee's stretch move on NumPy;
 - NumPyro's NUTS on JAX, with the posterior's covariance as dense mass matrix;
 - scipy's least squares with finite differences, on 2 sqrt(n + 3/8), whose variance is one.
 
-What they would have to find first is given to them: where the stars are imaged, and for sampling the maximum and its
-covariance. Effective draws a second are likelihoods (gradients) a second on the frame over likelihoods (gradients) per effective
-draw. The latter are counted on the Gaussian with the posterior's covariance, which it is close to, because on the frame itself
-they would take an hour; warm-up is left out. Effective draws are counted by one estimator, that of `diagnose`: of the slowest
-parameter, the lesser of bulk and tail. This package's own rate is that of a whole `sample`, the maximum and the checks included.
+What they would have to find first is given to them: where the stars are imaged, and for sampling
+the maximum and its covariance. Effective draws a second are likelihoods (gradients) a second on the
+frame over likelihoods (gradients) per effective draw. The latter are counted on the Gaussian with
+the posterior's covariance, which it is close to, because on the frame itself they would take an
+hour; warm-up is left out. Effective draws are counted by one estimator, that of `diagnose`: of the
+slowest parameter, the lesser of bulk and tail. This package's own rate is that of a whole `sample`,
+the maximum and the checks included.
 """
 
 import sys
@@ -28,7 +30,7 @@ from rich.table import Table
 from scipy import optimize
 
 import bayesfred as bf
-from bayesfred.inference.convergence import convergence
+from bayesfred.sampling.convergence import convergence
 
 RADIUS = 63  # of a stamp, pixels: 6.1 sigma is 1e-8 of the peak
 WALKERS = 32
@@ -52,7 +54,9 @@ class Stamps:
         self.variance = 2.0 * posterior.model.psf.sigma**2
         self.n = d.n_terms
         self.width = np.array([posterior.prior[name].std() for name in d.names])
-        self.level = posterior.prior["background"].kwds.get("scale", posterior.prior["background"].args[-1])
+        self.level = posterior.prior["background"].kwds.get(
+            "scale", posterior.prior["background"].args[-1]
+        )
 
     def stamps(self, theta, exp):  # type: ignore[no-untyped-def]  # of NumPy or of JAX
         """Expected counts of every source: the terms of `mirrored`, as polynomials in u and v for each source."""
@@ -76,7 +80,10 @@ class Stamps:
         if params[self.n] <= 0.0:
             return -np.inf
         mu = self.mean(params)
-        prior = -0.5 * np.sum((params[: self.n] / self.width) ** 2) - 0.5 * (params[self.n] / self.level) ** 2
+        prior = (
+            -0.5 * np.sum((params[: self.n] / self.width) ** 2)
+            - 0.5 * (params[self.n] / self.level) ** 2
+        )
         return float(self.counts @ np.log(mu) - mu.sum() + prior)
 
 
@@ -103,17 +110,28 @@ def own(posterior: bf.Posterior) -> tuple[float, float]:
 
         def sample() -> None:
             drawn.append(
-                bf.sample(posterior, path=Path(folder) / "own.h5", seed=1, target_ess=5000, overwrite=True, progress=False)
+                bf.sample(
+                    posterior,
+                    path=Path(folder) / "own.h5",
+                    seed=1,
+                    target_ess=5000,
+                    overwrite=True,
+                    progress=False,
+                )
             )
 
         spent = seconds(sample)
-    return seconds(lambda: bf.find_map(posterior), 3), effective(drawn[0].chain[:, drawn[0].burn_in :]) / spent
+    return seconds(lambda: bf.find_map(posterior), 3), effective(
+        drawn[0].chain[:, drawn[0].burn_in :]
+    ) / spent
 
 
 def stretch(stamps: Stamps, estimate: bf.MapEstimate) -> float:
     """Effective draws a second of emcee as it comes; its move is the same for every covariance."""
     d, steps = estimate.params.size, 20_000
-    sampler = emcee.EnsembleSampler(WALKERS, d, lambda z: -0.5 * np.sum(z**2, axis=1), vectorize=True)
+    sampler = emcee.EnsembleSampler(
+        WALKERS, d, lambda z: -0.5 * np.sum(z**2, axis=1), vectorize=True
+    )
     sampler.random_state = np.random.RandomState(1).get_state()
     sampler.run_mcmc(np.random.default_rng(1).standard_normal((WALKERS, d)), steps)
     share = effective(sampler.get_chain()[None]) / (steps * WALKERS)
@@ -135,7 +153,10 @@ def nuts(stamps: Stamps, estimate: bf.MapEstimate, start: np.ndarray) -> tuple[f
         params = estimate.params + lower @ z
         image = jnp.zeros(counts.size).at[place].add(stamps.stamps(params, jnp.exp).ravel())
         mu = jnp.maximum(image + params[stamps.n], 1e-9)
-        prior = 0.5 * jnp.sum((params[: stamps.n] / stamps.width) ** 2) + 0.5 * (params[stamps.n] / stamps.level) ** 2
+        prior = (
+            0.5 * jnp.sum((params[: stamps.n] / stamps.width) ** 2)
+            + 0.5 * (params[stamps.n] / stamps.level) ** 2
+        )
         return jnp.sum(mu - counts * jnp.log(mu)) + prior
 
     gradient = jax.jit(jax.value_and_grad(potential))
@@ -149,7 +170,14 @@ def nuts(stamps: Stamps, estimate: bf.MapEstimate, start: np.ndarray) -> tuple[f
     to_map = seconds(lambda: optimize.minimize(cost, begin, jac=True, method="L-BFGS-B"))
     draws = 4000
     kernel = NUTS(potential_fn=lambda z: 0.5 * jnp.sum(z**2), dense_mass=True)
-    run = MCMC(kernel, num_warmup=500, num_samples=draws, num_chains=4, chain_method="vectorized", progress_bar=False)
+    run = MCMC(
+        kernel,
+        num_warmup=500,
+        num_samples=draws,
+        num_chains=4,
+        chain_method="vectorized",
+        progress_bar=False,
+    )
     d = estimate.params.size
     run.run(jax.random.PRNGKey(1), init_params=jnp.zeros((4, d)), extra_fields=("num_steps",))
     chain = np.asarray(run.get_samples(group_by_chain=True))[:, :, None]
@@ -177,20 +205,42 @@ def main() -> int:
     estimate = bf.find_map(posterior)
     stamps = Stamps(posterior, estimate.params[:-1])
     truth = np.append(THETA, 5.0)
-    apart = stamps.log_prob(truth) - stamps.log_prob(estimate.params) - (posterior.log_prob(truth) - estimate.log_prob)
+    apart = (
+        stamps.log_prob(truth)
+        - stamps.log_prob(estimate.params)
+        - (posterior.log_prob(truth) - estimate.log_prob)
+    )
     if not abs(apart) < 1e-2:
         raise RuntimeError(f"the peers' posterior is another one: by {apart:.3g}")
-    rows = [("bayesfred", *own(posterior)), ("emcee's stretch move, NumPy", np.nan, stretch(stamps, estimate))]
+    rows = [
+        ("bayesfred", *own(posterior)),
+        ("emcee's stretch move, NumPy", np.nan, stretch(stamps, estimate)),
+    ]
     if find_spec("jax") and find_spec("numpyro"):
         rows.append(("NumPyro's NUTS, JAX", *nuts(stamps, estimate, posterior.start())))
     else:
-        rows.append(("NumPyro's NUTS, JAX: not installed, see the extra `benchmarks`", np.nan, np.nan))
-    rows.append(("scipy's least squares, finite differences", least_squares(stamps, posterior.start()), np.nan))
+        rows.append(
+            ("NumPyro's NUTS, JAX: not installed, see the extra `benchmarks`", np.nan, np.nan)
+        )
+    rows.append(
+        (
+            "scipy's least squares, finite differences",
+            least_squares(stamps, posterior.start()),
+            np.nan,
+        )
+    )
     table = Table(title="13 parameters, 81 sources on 505 x 505 pixels")
-    for head in ("posterior by", "seconds to the maximum", "effective draws a second", "bayesfred / this"):
+    for head in (
+        "posterior by",
+        "seconds to the maximum",
+        "effective draws a second",
+        "bayesfred / this",
+    ):
         table.add_column(head, justify="left" if head == "posterior by" else "right")
     for name, to_map, rate in rows:
-        cells = ("" if np.isnan(value) else f"{value:.3g}" for value in (to_map, rate, rows[0][2] / rate))
+        cells = (
+            "" if np.isnan(value) else f"{value:.3g}" for value in (to_map, rate, rows[0][2] / rate)
+        )
         table.add_row(name, *cells)
     Console(width=None if sys.stdout.isatty() else 110).print(table)
     best = np.nanmax([rate for _, _, rate in rows[1:]])

@@ -1,13 +1,16 @@
 """Whether the maximum is found without help: `python -m benchmarks.starts` fits random problems from counts alone.
 
-Every problem is drawn from its own number: a grid of 7 x 7 to 15 x 15 stars or 30 to 300 stars at random places, any of
-four sets of terms, a displacement at the field's corner of up to 1.5 times the stars' spacing and at most 80 pixels, a tenth of the
-catalogue's stars missing from the frame and as many spots that are in no catalogue. The fit is compared with the maximum found when
-the search starts at the truth. Results go to a file, one line a problem: a run that was stopped goes on where it was.
+Every problem is drawn from its own number: a grid of 7 x 7 to 15 x 15 stars or 30 to 300 stars at
+random places, any of four sets of terms, a displacement at the field's corner of up to 1.5 times
+the stars' spacing and at most 80 pixels, a tenth of the catalogue's stars missing from the frame
+and as many spots that are in no catalogue. The fit is compared with the maximum found when the
+search starts at the truth. Results go to a file, one line a problem: a run that was stopped goes on
+where it was.
 
-Fits are sigma-clipped, because no maximum of a posterior of all the spots is near the truth. The one from the truth is clipped from
-the truth, too, and may leave out other spots where it is close. The last column says how often the truth is as near to the maximum
-as error bars that hold promise in 99.9 %. A truth that folds the frame is outside the prior, and not drawn.
+Fits are sigma-clipped, because no maximum of a posterior of all the spots is near the truth. The
+one from the truth is clipped from the truth, too, and may leave out other spots where it is close.
+The last column says how often the truth is as near to the maximum as error bars that hold promise
+in 99.9 %. A truth that folds the frame is outside the prior, and not drawn.
 """
 
 import argparse
@@ -28,13 +31,13 @@ from rich.table import Table
 from scipy import linalg, optimize, stats
 
 import bayesfred as bf
-from bayesfred.inference.ascent import climb
+from bayesfred.optimize.newton import maximize
 
 TERMS = {
     "paper": bf.PolynomialDistortion.paper(),
     "mirrored": bf.PolynomialDistortion.mirrored(),
     "pinhole": bf.PolynomialDistortion.pinhole(),
-    "complete(3)": bf.PolynomialDistortion.complete(3),
+    "complete(3)": bf.PolynomialDistortion.full_polynomial(3),
 }
 METHODS = ("L-BFGS-B", "SLSQP", "trust-constr")
 LARGEST_FRAME = 400
@@ -60,17 +63,25 @@ def draw(number: int) -> tuple[bf.Posterior, np.ndarray, dict[str, Any]]:
     background = math.exp(rng.uniform(math.log(0.01), math.log(100.0)))
     shape = (2 * math.ceil(half + 1.1 * spacing) + 1,) * 2
     detector = bf.Detector(shape)
-    model = bf.ForwardModel(detector, bf.SourceCatalog(x, y, flux), bf.GaussianPSF(sigma), distortion)
+    model = bf.ForwardModel(
+        detector, bf.SourceCatalog(x, y, flux), bf.GaussianPSF(sigma), distortion
+    )
     theta, moved = coefficients(model, half, rng.uniform(0.0, min(80.0, 1.5 * spacing)), rng)
     lost = rng.random(x.size) < 0.1
     n_extra = rng.binomial(x.size, 0.1)
-    extra = bf.SourceCatalog(*rng.uniform(-half, half, (2, n_extra)), rng.choice(flux, n_extra)) if n_extra else None
+    extra = (
+        bf.SourceCatalog(*rng.uniform(-half, half, (2, n_extra)), rng.choice(flux, n_extra))
+        if n_extra
+        else None
+    )
     free = bool(rng.random() < 0.2 and x.size <= 150 and spacing > 4.0 * sigma)
     real = bf.SourceCatalog(x[~lost], y[~lost], flux[~lost])
     mean = bf.ForwardModel(detector, real, model.psf, distortion).expected_counts(theta, background)
     if extra:
         mean = mean + bf.ForwardModel(detector, extra, model.psf, distortion).expected_counts(theta)
-    posterior = bf.Posterior(model, rng.poisson(mean), nuisances=bf.Nuisances(flux="free" if free else "fixed"))
+    posterior = bf.Posterior(
+        model, rng.poisson(mean), nuisances=bf.Nuisances(flux="free" if free else "fixed")
+    )
     known = {
         "number": number, "terms": terms, "field": "grid" if grid else "random", "stars": x.size, "sigma": sigma,
         "spacing": spacing, "moved": moved, "background": background, "flux": float(np.median(flux)),
@@ -80,7 +91,9 @@ def draw(number: int) -> tuple[bf.Posterior, np.ndarray, dict[str, Any]]:
     return posterior, np.append(theta, background), known
 
 
-def coefficients(model: bf.ForwardModel, half: float, wanted: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+def coefficients(
+    model: bf.ForwardModel, half: float, wanted: float, rng: np.random.Generator
+) -> tuple[np.ndarray, float]:
     """Coefficients in a random ratio that move the field's corners by at most `wanted` pixels without a fold, and by how many."""
     d, s = model.distortion, model.sources
     fine = np.linspace(-half, half, 25)
@@ -100,13 +113,17 @@ def coefficients(model: bf.ForwardModel, half: float, wanted: float, rng: np.ran
     attempts = 0
     while True:
         attempts += 1
-        if attempts > 10:  # so far hardly any distortion of these terms moves the corners without a fold
+        if (
+            attempts > 10
+        ):  # so far hardly any distortion of these terms moves the corners without a fold
             wanted *= 0.9
         direction = scale * rng.standard_normal(d.n_terms)
         low, high = 0.0, 16.0
         for _ in range(40):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if displacement(middle * direction) <= wanted else (low, middle)
+            low, high = (
+                (middle, high) if displacement(middle * direction) <= wanted else (low, middle)
+            )
         moved = displacement(low * direction)
         # else it folds before it moves the corners so far, or elsewhere in the frame
         if moved > 0.9 * wanted and np.isfinite(posterior.log_prob([*low * direction, 1.0])):
@@ -119,8 +136,11 @@ def compile_all() -> None:
     for distortion in TERMS.values():
         model = bf.ForwardModel(detector, sources, bf.GaussianPSF(3.0), distortion)
         counts = bf.simulate(model, np.zeros(distortion.n_terms), 2.0, seed=1)
-        for posterior in (bf.Posterior(model, counts), bf.Posterior(model, counts, nuisances=bf.Nuisances(flux="free"))):
-            climb(posterior, posterior.start())
+        for posterior in (
+            bf.Posterior(model, counts),
+            bf.Posterior(model, counts, nuisances=bf.Nuisances(flux="free")),
+        ):
+            maximize(posterior, posterior.start())
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -138,9 +158,15 @@ def scipys(posterior: bf.Posterior, method: str) -> np.ndarray:
         params = origin + scale * z
         value = -float(posterior.log_prob(params))
         # outside the prior's support a wall, which these methods can step back from
-        return (value, -scale * posterior.gradient(params)) if math.isfinite(value) else (1e12, np.zeros(z.size))
+        return (
+            (value, -scale * posterior.gradient(params))
+            if math.isfinite(value)
+            else (1e12, np.zeros(z.size))
+        )
 
-    result = optimize.minimize(cost, np.zeros(origin.size), method=method, jac=True, options={"maxiter": 200})
+    result = optimize.minimize(
+        cost, np.zeros(origin.size), method=method, jac=True, options={"maxiter": 200}
+    )
     return np.asarray(origin + scale * result.x)
 
 
@@ -148,14 +174,16 @@ def solve(task: tuple[int, bool]) -> dict[str, Any]:
     """Fit a problem from counts alone, and from the truth, and by scipy's optimisers if asked to."""
     number, with_rivals = task
     posterior, truth, out = draw(number)
-    (clipped, best), out["truth_seconds"] = timed(lambda: bf.sigma_clip(posterior, truth))
-    (_, estimate), out["seconds"] = timed(lambda: bf.sigma_clip(posterior))
+    (clipped, best), out["truth_seconds"] = timed(lambda: bf.reject_outliers(posterior, truth))
+    (_, estimate), out["seconds"] = timed(lambda: bf.reject_outliers(posterior))
 
     def square(params: np.ndarray, reference: bf.MapEstimate) -> float:
         """Mahalanobis distance over its 99.9 % quantile, squared; infinite if there is no maximum."""
         sd = np.sqrt(np.diag(reference.covariance))
         d, correlation = (params - reference.params) / sd, reference.covariance / np.outer(sd, sd)
-        length = float(d @ linalg.solve(correlation, d, assume_a="pos")) / stats.chi2.ppf(0.999, truth.size)
+        length = float(d @ linalg.solve(correlation, d, assume_a="pos")) / stats.chi2.ppf(
+            0.999, truth.size
+        )
         return length if reference.at_maximum else math.inf
 
     out |= {"found": square(estimate.params, best), "truth": square(truth, estimate)}
@@ -203,8 +231,12 @@ def table(rows: Iterable[dict[str, Any]]) -> Table:
         for value in sorted({stratum(row) for row in rows}, key=order):
             part = [row for row in rows if stratum(row) == value]
             cells = [share([row["found"] for row in part])]
-            cells.append(f"{sum(row['seconds'] for row in part) / sum(row['truth_seconds'] for row in part):.2f}")
-            cells += [share([row[method]["found"] for row in part if method in row]) for method in METHODS]
+            cells.append(
+                f"{sum(row['seconds'] for row in part) / sum(row['truth_seconds'] for row in part):.2f}"
+            )
+            cells += [
+                share([row[method]["found"] for row in part if method in row]) for method in METHODS
+            ]
             cells.append(share([row["truth"] for row in part]))
             out.add_row(name, value, str(len(part)), *cells)
     return out
@@ -212,12 +244,24 @@ def table(rows: Iterable[dict[str, Any]]) -> Table:
 
 def logarithm() -> Table:
     """The paper's Fig. 2c, without noise but for a background, fitted by least squares with its own kernel."""
-    detector, sources, psf = bf.Detector((505, 505)), bf.SourceCatalog.grid(9, 50.0, 1e5), bf.GaussianPSF(10.0)
-    frame = bf.ForwardModel(detector, sources, psf, bf.LogDistortion(1e-5), conserve_flux=False).expected_counts([], 5.0)
-    out = Table(title="the paper's Fig. 2c; the paper's V is 2.8e-3, of a logarithmic frame of 3175 x 3175 pixels binned to 127")
+    detector, sources, psf = (
+        bf.Detector((505, 505)),
+        bf.SourceCatalog.grid(9, 50.0, 1e5),
+        bf.GaussianPSF(10.0),
+    )
+    frame = bf.ForwardModel(
+        detector, sources, psf, bf.LogDistortion(1e-5), conserve_flux=False
+    ).expected_counts([], 5.0)
+    out = Table(
+        title="the paper's Fig. 2c; the paper's V is 2.8e-3, of a logarithmic frame of 3175 x "
+        "3175 pixels binned to 127"
+    )
     for head in ("terms", "V / flux^2", "how"):
         out.add_column(head)
-    for name, distortion in (("mirrored", TERMS["mirrored"]), ("complete(4)", bf.PolynomialDistortion.complete(4))):
+    for name, distortion in (
+        ("mirrored", TERMS["mirrored"]),
+        ("complete(4)", bf.PolynomialDistortion.full_polynomial(4)),
+    ):
         model = bf.ForwardModel(detector, sources, psf, distortion, conserve_flux=False)
         posterior = bf.Posterior(model, frame, noise=bf.BackgroundNoise())
         estimate = bf.find_map(posterior)
@@ -229,18 +273,32 @@ def logarithm() -> Table:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--problems", type=int, default=500)
-    parser.add_argument("--rivals", type=int, default=60, help="scipy's optimisers try this many of the problems")
+    parser.add_argument(
+        "--rivals", type=int, default=60, help="scipy's optimisers try this many of the problems"
+    )
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--output", type=Path, default=Path("starts.jsonl"), help="results, one line a problem")
+    parser.add_argument(
+        "--output", type=Path, default=Path("starts.jsonl"), help="results, one line a problem"
+    )
     options = parser.parse_args()
-    os.environ.update(NUMBA_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")  # of the processes to come
+    os.environ.update(
+        NUMBA_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
+    )  # of the processes to come
     lines = options.output.read_text().splitlines() if options.output.exists() else []
     rows = {row["number"]: row for row in map(json.loads, lines)}
     tried = {k for k, row in rows.items() if k >= options.rivals or METHODS[0] in row}
     tasks = [(k, k < options.rivals) for k in range(options.problems) if k not in tried]
     console = Console(stderr=True)
-    with multiprocessing.get_context("spawn").Pool(options.processes, compile_all) as pool, options.output.open("a") as file:
-        for row in track(pool.imap_unordered(solve, tasks), total=len(tasks), console=console, description="problems"):
+    with (
+        multiprocessing.get_context("spawn").Pool(options.processes, compile_all) as pool,
+        options.output.open("a") as file,
+    ):
+        for row in track(
+            pool.imap_unordered(solve, tasks),
+            total=len(tasks),
+            console=console,
+            description="problems",
+        ):
             file.write(json.dumps(row) + "\n")
             file.flush()
             rows[row["number"]] = row
@@ -249,7 +307,10 @@ def main() -> int:
     out.print(table(rows.values()))
     for row in rows.values():
         if not row["found"] <= 1.0:
-            out.print(f"problem {row['number']}: {math.sqrt(row['found']):.1f} times too far: {row['message']}")
+            out.print(
+                f"problem {row['number']}: {math.sqrt(row['found']):.1f} times too far: "
+                f"{row['message']}"
+            )
     out.print(figure)
     return 0
 

@@ -2,9 +2,10 @@
 
     BAYESFRED_DATA=<folder with the frames> python examples/startracker.py
 
-The frames are ESA's (Gustav Pettersson, CC BY-SA 3.0 IGO), from the test images of https://github.com/esa/tetra3. Both are
-fitted as `bayesfred fit` does, into chains/. A lens makes the four cubic terms x^3 and x y^2 of u, x^2 y and y^3 of v equal; they
-are printed in pixels at 512 pixels from the middle, as displacement of the star (minus the coefficient of f or g).
+The frames are ESA's (Gustav Pettersson, CC BY-SA 3.0 IGO), from the test images of
+https://github.com/esa/tetra3. Both are fitted as `bayesfred fit` does, into chains/. A lens makes
+the four cubic terms x^3 and x y^2 of u, x^2 y and y^3 of v equal; they are printed in pixels at 512
+pixels from the middle, as displacement of the star (minus the coefficient of f or g).
 """
 
 import csv
@@ -19,7 +20,12 @@ from bayesfred import settings
 HERE = Path(__file__).parent
 RUNS = ("startracker.toml", "startracker_alt40_azi135.toml")
 CUBIC = ("f_x3", "f_xy2", "g_x2y", "g_y3")
-CENTROIDS = (0.56, 0.56, 0.53, 0.51)  # least squares on the centroids of all eight frames of the set
+CENTROIDS = (
+    0.56,
+    0.56,
+    0.53,
+    0.51,
+)  # least squares on the centroids of all eight frames of the set
 CENTROID_ERROR = 0.05  # of a single frame's radial coefficient
 RADIUS = 512.0
 
@@ -29,7 +35,7 @@ def main() -> int:
     for name in RUNS:
         run_file = HERE / name
         print(f"\n{name}")
-        result = bf.runs.fit(run_file, overwrite="--overwrite" in sys.argv)
+        result = bf.commands.fit(run_file, overwrite="--overwrite" in sys.argv)
         converged = converged and result.diagnostics.converged
         compare(run_file, result.chain)
     return 0 if converged else 3
@@ -51,28 +57,39 @@ def compare(run_file: Path, chain: bf.Chain) -> None:
         print(f"{name:6}  {mean:.3f} +- {sd:.3f}    {centroid:.2f}        {z:+.1f}")
     tau = draws[:, names.index("position_scatter")]
     print(
-        f"The frame's centroids lie {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}) pixel off this fit in the mean; singly,\n"
-        f"{scatter:.3f} (rms along an axis), which is {ratio:.1f} times their errors from photon noise. The posterior knows. It\n"
-        f"finds that the stars scatter by {tau.mean():.3f} +- {tau.std(ddof=1):.3f} pixel about the catalogue, draws each where\n"
-        "it is, so that no star is left with a dipole, and widens the errors of the terms. Likely causes: proper motion\n"
-        "since the catalogue's epoch, close pairs, the air's turbulence during a short exposure, and a PSF that is no\n"
+        f"The frame's centroids lie {mean_u:+.3f}, {mean_v:+.3f} (+- {error:.3f}) pixel off this "
+        "fit in the mean; singly,\n"
+        f"{scatter:.3f} (rms along an axis), which is {ratio:.1f} times their errors from photon "
+        "noise. The posterior knows. It\n"
+        f"finds that the stars scatter by {tau.mean():.3f} +- {tau.std(ddof=1):.3f} pixel about "
+        "the catalogue, draws each where\n"
+        "it is, so that no star is left with a dipole, and widens the errors of the terms. Likely "
+        "causes: proper motion\n"
+        "since the catalogue's epoch, close pairs, the air's turbulence during a short exposure, "
+        "and a PSF that is no\n"
         "Gaussian in the 1.5 pixels that it covers."
     )
     if worst < 3:
         print("Posterior and centroids agree within 3 errors.")
     else:
-        print("Posterior and centroids do not all agree: few of one frame's stars are in the corners that fix x^3 and y^3.")
+        print(
+            "Posterior and centroids do not all agree: few of one frame's stars are in the "
+            "corners that fix x^3 and y^3."
+        )
 
 
 def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float, float, float, float]:
     """How the stars' centroids lie about the fit.
 
-    Mean along u and v with its error, root mean square per axis, pixel; and the latter in units of the centroids' errors.
+    Mean along u and v with its error, root mean square per axis, pixel; and the latter in units of
+    the centroids' errors.
     """
     run = settings.read_settings(run_file)
     catalogue = settings.resolve(run.catalogue.path, run_file, must_exist=True)
     stars = read(catalogue, "hip", "x", "y")
-    centroids = read(catalogue.with_name(catalogue.stem + "_centroids.csv"), "hip", "u", "v", "err_u", "err_v")
+    centroids = read(
+        catalogue.with_name(catalogue.stem + "_centroids.csv"), "hip", "u", "v", "err_u", "err_v"
+    )
     measured = {row[0]: row[1:] for row in centroids}
     rows = np.array([[x, y, *measured[hip]] for hip, x, y in stars if hip in measured])
     x, y, u, v, error_u, error_v = rows.T
@@ -85,7 +102,9 @@ def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float, float, 
     weight = error**-2.0
     mean_u, mean_v = np.sum(weight * off, axis=1) / np.sum(weight, axis=1)
     scatter = np.sqrt(np.sum(weight * off**2) / np.sum(weight))
-    error_of_mean = scatter * np.sqrt(np.mean(np.sum(weight**2, axis=1) / np.sum(weight, axis=1) ** 2))
+    error_of_mean = scatter * np.sqrt(
+        np.mean(np.sum(weight**2, axis=1) / np.sum(weight, axis=1) ** 2)
+    )
     return mean_u, mean_v, error_of_mean, scatter, np.sqrt(np.mean((off / error) ** 2))
 
 

@@ -1,7 +1,8 @@
 """Slow images written from the formulas alone: every pixel, every source, one term at a time, no truncation.
 
-Nothing here knows the package: the tests compare the package with this. Terms are (i, j, m, n), the powers of
-x, y, u, v; a catalogue is three sequences x, y, flux; coordinates are fine pixels from the frame's middle.
+Nothing here knows the package: the tests compare the package with this. Terms are (i, j, m, n), the
+powers of x, y, u, v; a catalogue is three sequences x, y, flux; coordinates are fine pixels from
+the frame's middle.
 """
 
 from __future__ import annotations
@@ -66,7 +67,9 @@ def impulse_nodes(shape: tuple[int, int], binning: int = 1) -> tuple[FloatArray,
     return middle_out(shape[1] * binning), middle_out(shape[0] * binning)
 
 
-def box_nodes(shape: tuple[int, int], binning: int = 1, order: int = 7) -> tuple[FloatArray, FloatArray]:
+def box_nodes(
+    shape: tuple[int, int], binning: int = 1, order: int = 7
+) -> tuple[FloatArray, FloatArray]:
     """u and v of `order` Gauss-Legendre nodes in every fine pixel."""
     offsets = np.polynomial.legendre.leggauss(order)[0] / 2
     u, v = impulse_nodes(shape, binning)
@@ -92,7 +95,10 @@ def impulse_counts(
 ) -> FloatArray:
     """Sums of the samples at the fine pixels' centres, shape `shape`, counts per recorded pixel."""
     nodes = impulse_nodes(shape, binning)
-    return bin_fine(dense_image(f_terms, g_terms, theta, sources, sigma, nodes, conserve_flux=conserve_flux), binning)
+    return bin_fine(
+        dense_image(f_terms, g_terms, theta, sources, sigma, nodes, conserve_flux=conserve_flux),
+        binning,
+    )
 
 
 def box_counts(

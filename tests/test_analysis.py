@@ -12,10 +12,10 @@ from scipy.special import rel_entr, xlogy
 from scipy.stats import norm, poisson
 
 from bayesfred.analysis.diagnostics import autocorrelation_time, diagnose
-from bayesfred.inference.convergence import convergence, effective_size, rank_rhat
-from bayesfred.inference.goodness import deviance_moments
-from bayesfred.inference.noise import BackgroundNoise
-from bayesfred.inference.posterior import Nuisances
+from bayesfred.model.noise import BackgroundNoise
+from bayesfred.model.posterior import Nuisances
+from bayesfred.optimize.fit_statistics import deviance_moments
+from bayesfred.sampling.convergence import convergence, effective_size, rank_rhat
 
 Floats = NDArray[np.float64]
 
@@ -30,12 +30,14 @@ def ar1(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Floats:
     return x
 
 
-def ensembles(rng: np.random.Generator, n_steps: int, phi: float = 0.0, d: int = 1, n_walkers: int = 32) -> Floats:
+def ensembles(
+    rng: np.random.Generator, n_steps: int, phi: float = 0.0, d: int = 1, n_walkers: int = 32
+) -> Floats:
     """A chain (4, n_steps, n_walkers, d) of independent AR(1) walkers."""
     return np.ascontiguousarray(ar1(rng, (4, n_walkers, d, n_steps), phi).transpose(0, 3, 1, 2))
 
 
-# --- convergence ------------------------------------------------------------------------------------------
+# --- convergence ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n_steps", [8, 10, 13, 20, 50, 200])
@@ -51,7 +53,8 @@ def test_effective_size_is_unbiased_for_chains_of_any_length(n_steps: int, phi: 
 
 
 def test_usual_estimator_fails_where_this_one_does_not() -> None:
-    # the negative control of the test above: what it would say of an estimator with a mean per chain
+    # the negative control of the test above: what it would say of an estimator with a mean per
+    # chain
     walkers = ar1(np.random.default_rng(2), (128, 8), 0.9)
     truth = walkers.size * 0.1 / 1.9
     assert array_stats.ess(walkers) > 30.0 * truth
@@ -63,7 +66,9 @@ def test_effective_size_agrees_with_the_usual_estimator_for_long_chains() -> Non
     _, bulk, tail = convergence(chain)
     walkers = chain[..., 0].transpose(0, 2, 1).reshape(-1, 2000)
     assert bulk[0] == pytest.approx(array_stats.ess(walkers, method="bulk"), rel=0.05)
-    assert tail[0] == pytest.approx(array_stats.ess(walkers, method="tail", prob=(0.05, 0.95)), rel=0.05)
+    assert tail[0] == pytest.approx(
+        array_stats.ess(walkers, method="tail", prob=(0.05, 0.95)), rel=0.05
+    )
 
 
 def test_effective_size_predicts_the_error_of_the_mean() -> None:
@@ -132,7 +137,7 @@ def test_autocorrelation_time_agrees_with_emcee_and_with_the_truth() -> None:
     assert np.isnan(autocorrelation_time(np.ones((4, 10))))
 
 
-# --- goodness of fit --------------------------------------------------------------------------------------
+# --- goodness of fit ------------------------------------------------------------------------------
 
 
 def direct_moments(mu: float) -> tuple[float, float, float]:
@@ -142,7 +147,11 @@ def direct_moments(mu: float) -> tuple[float, float, float]:
     chance = poisson.pmf(n, mu)
     deviance = 2.0 * (xlogy(n, n / mu) - n + mu)
     mean = float(chance @ deviance)
-    return mean, float(chance @ (deviance - mean) ** 2), float(chance @ ((deviance - mean) * (n - mu))) / mu
+    return (
+        mean,
+        float(chance @ (deviance - mean) ** 2),
+        float(chance @ ((deviance - mean) * (n - mu))) / mu,
+    )
 
 
 def test_deviance_moments_equal_direct_sums() -> None:
@@ -197,7 +206,9 @@ def most_likely(counts: Floats, start: tuple[float, float], read_noise: float = 
     for _ in range(12):
         mu = design @ params + read_noise**2
         weighted = design / mu[:, None]
-        step = np.linalg.solve(weighted.T @ design, weighted.T @ (counts.ravel() + read_noise**2 - mu))
+        step = np.linalg.solve(
+            weighted.T @ design, weighted.T @ (counts.ravel() + read_noise**2 - mu)
+        )
         params = np.maximum(params + step, 1e-6)
     return params
 
@@ -224,7 +235,11 @@ def refits(flux: float, background: float, read_noise: float = 0.0, n: int = 300
     mu = flux * profile() + background
     out = []
     for _ in range(n):
-        counts = rng.poisson(mu) + rng.normal(0.0, read_noise, SHAPE) if read_noise else rng.poisson(mu).astype(float)
+        counts = (
+            rng.poisson(mu) + rng.normal(0.0, read_noise, SHAPE)
+            if read_noise
+            else rng.poisson(mu).astype(float)
+        )
         posterior = linear_posterior(counts, SimpleNamespace(read_noise=read_noise))
         params = most_likely(counts, (flux, background), read_noise)
         out.append(diagnose(chain_at(params, posterior), target_ess=100.0))
@@ -233,9 +248,17 @@ def refits(flux: float, background: float, read_noise: float = 0.0, n: int = 300
 
 @pytest.mark.parametrize(("flux", "background"), [(3000.0, 5.0), (400.0, 0.1)])
 @pytest.mark.parametrize("statistic", ["pearson", "deviance"])
-def test_statistics_of_fitted_frames_have_the_stated_mean_and_sd(flux: float, background: float, statistic: str) -> None:
+def test_statistics_of_fitted_frames_have_the_stated_mean_and_sd(
+    flux: float, background: float, statistic: str
+) -> None:
     results = refits(flux, background)
-    z = np.array([(getattr(r, statistic) - getattr(r, f"{statistic}_expected")) / getattr(r, f"{statistic}_sd") for r in results])
+    z = np.array(
+        [
+            (getattr(r, statistic) - getattr(r, f"{statistic}_expected"))
+            / getattr(r, f"{statistic}_sd")
+            for r in results
+        ]
+    )
     error = 1.0 / np.sqrt(z.size)
     assert abs(z.mean()) < 4.0 * error
     assert abs(z.std() - 1.0) < 4.0 * error / np.sqrt(2.0)
@@ -245,7 +268,9 @@ def test_sd_of_a_known_mean_would_fail_at_low_counts() -> None:
     # the negative control: N (2 + 1/mu) forgets that the background was fitted
     results = refits(400.0, 0.1)
     mu = 400.0 * profile() + 0.1
-    z = np.array([r.pearson - r.pearson_expected for r in results]) / np.sqrt(np.sum(2.0 + 1.0 / mu))
+    z = np.array([r.pearson - r.pearson_expected for r in results]) / np.sqrt(
+        np.sum(2.0 + 1.0 / mu)
+    )
     assert z.std() < 0.6
 
 
@@ -306,18 +331,21 @@ def test_a_varying_background_has_no_paper_statistic() -> None:
     assert np.isnan(result.background_estimate) and np.isnan(result.chi2_paper)
 
 
-# --- sensitivity ------------------------------------------------------------------------------------------
+# --- sensitivity ----------------------------------------------------------------------------------
 
 
 def weighed(prior: Any, likelihood: Any, steps: int = 300) -> Any:
     """`diagnose` of draws from a posterior that is normal in both parameters, the second of which the prior leaves alone.
 
-    Prior and likelihood are normal distributions of the first parameter; the second's likelihood is standard normal.
+    Prior and likelihood are normal distributions of the first parameter; the second's likelihood is
+    standard normal.
     """
     weights = np.array([part.std() ** -2 for part in (prior, likelihood)])
     mean, sd = weights @ [prior.mean(), likelihood.mean()] / weights.sum(), weights.sum() ** -0.5
     draws = np.random.default_rng(14).normal(size=(4, steps, 32, 2)) * [sd, 1.0] + [mean, 0.0]
-    log_prob = prior.logpdf(draws[..., 0]) + likelihood.logpdf(draws[..., 0]) + norm.logpdf(draws[..., 1])
+    log_prob = (
+        prior.logpdf(draws[..., 0]) + likelihood.logpdf(draws[..., 0]) + norm.logpdf(draws[..., 1])
+    )
     posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
     posterior.log_prior = lambda x: prior.logpdf(x[:, 0])
     return diagnose(chain_at(np.array([1.0, 5.0]), posterior, chain=draws, log_prob=log_prob))
@@ -344,7 +372,9 @@ def sensitivity(scaled: Any, fixed: Any) -> float:
         a, b = alpha / scaled.var(), 1.0 / fixed.var()
         return norm((a * scaled.mean() + b * fixed.mean()) / (a + b), (a + b) ** -0.5)
 
-    moved = [distance(posterior(1.0), posterior(alpha)) / abs(np.log2(alpha)) for alpha in (0.99, 1.01)]
+    moved = [
+        distance(posterior(1.0), posterior(alpha)) / abs(np.log2(alpha)) for alpha in (0.99, 1.01)
+    ]
     return float(np.mean(moved))
 
 
@@ -355,14 +385,19 @@ FRAME = norm(0.0, 1.0)  # a likelihood
 def test_sensitivity_of_a_conjugate_normal_is_known(prior: Any) -> None:
     # over seeds the sensitivity scatters by up to 3.6 %, or 1e-4 where it is small
     result = weighed(prior, FRAME)
-    assert result.prior_sensitivity["flux_scale"] == pytest.approx(sensitivity(prior, FRAME), rel=0.15, abs=4e-4)
-    assert result.likelihood_sensitivity["flux_scale"] == pytest.approx(sensitivity(FRAME, prior), rel=0.15, abs=4e-4)
+    assert result.prior_sensitivity["flux_scale"] == pytest.approx(
+        sensitivity(prior, FRAME), rel=0.15, abs=4e-4
+    )
+    assert result.likelihood_sensitivity["flux_scale"] == pytest.approx(
+        sensitivity(FRAME, prior), rel=0.15, abs=4e-4
+    )
     assert result.prior_sensitivity["background"] < 0.01  # but for chance the prior has no say
     assert result.likelihood_sensitivity["background"] > 0.05
 
 
 def test_narrow_priors_are_named_and_broad_ones_are_not() -> None:
-    # 2,560 draws, as a short run has; the frame's value lies a typical distance from the middle of the prior
+    # 2,560 draws, as a short run has; the frame's value lies a typical distance from the middle of
+    # the prior
     for sd, named in ((0.5, True), (1.0, True), (10.0, False), (1000.0, False)):
         prior = norm(np.hypot(sd, 1.0), sd)
         assert weighed(prior, FRAME, steps=20).prior_dominated == (("flux_scale",) if named else ())
@@ -372,11 +407,15 @@ def test_sensitivity_needs_draws_that_vary() -> None:
     for chain in (np.ones((4, 15, 32, 2)), np.random.default_rng(15).normal(size=(2, 4, 4, 2))):
         posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
         posterior.log_prior = lambda x: -0.5 * x[:, 0] ** 2
-        result = diagnose(chain_at(np.array([1.0, 5.0]), posterior, chain=chain, log_prob=-0.5 * chain[..., 0] ** 2))
+        result = diagnose(
+            chain_at(
+                np.array([1.0, 5.0]), posterior, chain=chain, log_prob=-0.5 * chain[..., 0] ** 2
+            )
+        )
         assert result.prior_dominated == ()
 
 
-# --- verdict ----------------------------------------------------------------------------------------------
+# --- verdict --------------------------------------------------------------------------------------
 
 
 def healthy_chain(**changes: Any) -> Any:
@@ -406,7 +445,14 @@ def shifted() -> Floats:
         ({"accepted": np.full((4, 32), 1)}, "acceptance"),
         ({"burn_in": 9}, "effective sample size"),
         ({"burn_in": 15}, "R-hat"),
-        ({"estimate": SimpleNamespace(params=np.array([1.0, 5.0]), at_maximum=False, message="lost")}, "lost"),
+        (
+            {
+                "estimate": SimpleNamespace(
+                    params=np.array([1.0, 5.0]), at_maximum=False, message="lost"
+                )
+            },
+            "lost",
+        ),
     ],
     ids=["ensembles disagree", "hardly accepts", "too short", "no draws", "no MAP"],
 )

@@ -1,6 +1,7 @@
 """Leave-one-out against brute force, against the frames that are truly left out, and on models that are known to be wrong.
 
-One source of 2,000 photons in 25 x 25 pixels; the chains are draws, not runs, so that each test costs a second or two.
+One source of 2,000 photons in 25 x 25 pixels; the chains are draws, not runs, so that each test
+costs a second or two.
 """
 
 from pathlib import Path
@@ -25,10 +26,14 @@ TRUTH = (4e-3, 1.0)
 
 def forward(*f_terms: tuple[int, ...], flux: float = 2000.0) -> bf.ForwardModel:
     sources = bf.SourceCatalog([-6.0, 6.0, 6.0], [0.0, -5.0, 6.0], [flux] * 3)
-    return bf.ForwardModel(bf.Detector((25, 25)), sources, bf.GaussianPSF(2.0), bf.PolynomialDistortion(f_terms, []))
+    return bf.ForwardModel(
+        bf.Detector((25, 25)), sources, bf.GaussianPSF(2.0), bf.PolynomialDistortion(f_terms, [])
+    )
 
 
-def posterior(*f_terms: tuple[int, ...], counts: Floats | None = None, **options: Any) -> bf.Posterior:
+def posterior(
+    *f_terms: tuple[int, ...], counts: Floats | None = None, **options: Any
+) -> bf.Posterior:
     frame = bf.simulate(forward(TERM), TRUTH[:1], TRUTH[1], seed=3) if counts is None else counts
     return bf.Posterior(forward(*f_terms), frame, **options)
 
@@ -125,7 +130,11 @@ def test_what_cannot_be_compared_is_refused(right: Any) -> None:
     other = SimpleNamespace(posterior=lambda: bf.Posterior(target.model, target.counts, mask=mask))
     with pytest.raises(bf.InputError, match="other: mask"):
         compare({"a": right, "other": other})
-    other = SimpleNamespace(posterior=lambda: bf.Posterior(target.model, target.counts, nuisances=bf.Nuisances(flux="free")))
+    other = SimpleNamespace(
+        posterior=lambda: bf.Posterior(
+            target.model, target.counts, nuisances=bf.Nuisances(flux="free")
+        )
+    )
     with pytest.raises(bf.InputError, match="other: fluxes: got free ones"):
         compare({"a": right, "other": other})
 
@@ -138,7 +147,11 @@ def test_command_ranks_chain_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert result.exit_code == 0
     assert result.output.index("right.h5") < result.output.index("wrong.h5")
     assert "chosen: right.h5" in result.output
-    for arguments, said in ((["right.h5"], "at least two"), (["right.h5", "right.h5"], "twice"), (["right.h5", "no.h5"], "no.h5")):
+    for arguments, said in (
+        (["right.h5"], "at least two"),
+        (["right.h5", "right.h5"], "twice"),
+        (["right.h5", "no.h5"], "no.h5"),
+    ):
         refused = CliRunner().invoke(app, ["compare", *arguments])
         assert refused.exit_code == 2
         assert said in refused.output and "Traceback" not in refused.output

@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats
-from test_inference import dense_image
+from test_model import dense_image
 
 import bayesfred as bf
-from bayesfred import files
-from bayesfred.analysis import sbc, tasks
-from bayesfred.analysis import study as noise_levels
-from bayesfred.analysis.refit import given, seeds
-from bayesfred.analysis.tasks import Answer
-from bayesfred.analysis.uniformity import band, ecdf, points, uniformity
+from bayesfred.analysis import executor, sbc
+from bayesfred.analysis import noise_study as noise_levels
+from bayesfred.analysis.ecdf_bands import band, ecdf, points, uniformity
+from bayesfred.analysis.executor import Answer
+from bayesfred.analysis.study_helpers import given, seeds
 from bayesfred.errors import InputError
+from bayesfred.io import files
 from bayesfred.reporting import plots
 
 Floats = NDArray[np.float64]
@@ -37,7 +37,11 @@ def tiny(**options: Any) -> bf.ForwardModel:
     """Four sources and two terms: a fit takes milliseconds."""
     distortion = bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[(0, 1, 0, 1)])
     return bf.ForwardModel(
-        bf.Detector((31, 31)), bf.SourceCatalog.grid(2, 14.0, 1000.0), bf.GaussianPSF(2.0), distortion, **options
+        bf.Detector((31, 31)),
+        bf.SourceCatalog.grid(2, 14.0, 1000.0),
+        bf.GaussianPSF(2.0),
+        distortion,
+        **options,
     )
 
 
@@ -52,7 +56,7 @@ def lines(path: Path) -> list[str]:
     return sorted(rows, key=lambda line: int(line.split(",")[0]))
 
 
-# ---------------------------------------------------------------------------------------------------------------------- uniformity
+# --------------------------------------------------------------------------------------------------
 
 
 def leaves(values: Floats, probability: float) -> bool:
@@ -87,7 +91,7 @@ def test_band_of_one_point_is_binomial() -> None:
     assert uniformity(np.array([0.1, 0.2])) == pytest.approx(0.5)
 
 
-# ---------------------------------------------------------------------------------------------------------------------- simulating
+# --------------------------------------------------------------------------------------------------
 
 
 def everything(model: bf.ForwardModel, noise: Any, **options: Any) -> bf.Posterior:
@@ -101,12 +105,21 @@ def test_simulated_frame_is_that_of_the_parameters() -> None:
     params = np.array([*TRUTH, 1e-12, 1.1, 0.4, -0.3, 1.8])
     named = dict(zip(posterior.parameter_names, params, strict=True))
     frame = posterior.simulate(params, np.random.default_rng(1))
-    assert frame == pytest.approx(dense_image(model, named, 1.1 * model.sources.flux), rel=1e-9, abs=1e-9)
+    assert frame == pytest.approx(
+        dense_image(model, named, 1.1 * model.sources.flux), rel=1e-9, abs=1e-9
+    )
 
 
 def test_simulated_background_and_noise() -> None:
     """Means of 2,000 frames: 4 standard errors a pixel are exceeded by chance in 6 of 100,000."""
-    posterior = everything(tiny(), bf.PoissonNoise(1.5), flux="fixed", offset=False, psf_sigma=False, background_order=1)
+    posterior = everything(
+        tiny(),
+        bf.PoissonNoise(1.5),
+        flux="fixed",
+        offset=False,
+        psf_sigma=False,
+        background_order=1,
+    )
     params = np.array([*TRUTH, 3.0, 1.0, -0.5])
     rng = np.random.default_rng(2)
     frames = np.array([posterior.simulate(params, rng) for _ in range(2000)])
@@ -126,7 +139,9 @@ def test_simulated_fluxes_and_shifts_have_their_priors() -> None:
     frames = [posterior.simulate([0.0, 0.0, 1e-9, 0.5], rng) for _ in range(n)]
     total = np.array([np.sum(frame) for frame in frames if frame is not None])
     assert total.mean() == pytest.approx(1e6, abs=4 * 1e6 / np.sqrt(2 * n))
-    assert total.std() == pytest.approx(1e6 / np.sqrt(2), rel=4 * np.sqrt((stats.gamma(2).stats("k") + 2) / (4 * n)))
+    assert total.std() == pytest.approx(
+        1e6 / np.sqrt(2), rel=4 * np.sqrt((stats.gamma(2).stats("k") + 2) / (4 * n))
+    )
     u = np.arange(-20.0, 21.0)
     across = np.array([np.sum(frame @ u) for frame in frames if frame is not None]) / total
     assert across.mean() == pytest.approx(2.0, abs=4 * 0.5 / np.sqrt(n))
@@ -143,7 +158,10 @@ def test_folded_and_negative_frames_are_none() -> None:
 
 
 def test_seeds_are_the_children_of_one() -> None:
-    assert seeds(5, 3).generate_state(4).tolist() == np.random.SeedSequence(5).spawn(4)[3].generate_state(4).tolist()
+    assert (
+        seeds(5, 3).generate_state(4).tolist()
+        == np.random.SeedSequence(5).spawn(4)[3].generate_state(4).tolist()
+    )
 
 
 def test_sources_are_the_brightest_and_spread() -> None:
@@ -153,7 +171,7 @@ def test_sources_are_the_brightest_and_spread() -> None:
     assert noise_levels._spread(bright, 2).tolist() == [5, 7]
 
 
-# -------------------------------------------------------------------------------------------------------------------- noise levels
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_frame_of_a_noise_study_is_an_ordinary_fit(tmp_path: Path) -> None:
@@ -175,7 +193,9 @@ def test_a_frame_of_a_noise_study_is_an_ordinary_fit(tmp_path: Path) -> None:
         z = ((*TRUTH, 50.0)[j] - estimate.params[j]) / np.sqrt(estimate.covariance[j, j])
         assert rows[f"{name}.pit"][k] == pytest.approx(stats.norm.cdf(z), rel=1e-9)
     off = estimate.params[:2] - TRUTH
-    assert rows["theta.distance"][k] == pytest.approx(off @ np.linalg.inv(bound[:2, :2]) @ off, rel=1e-9)
+    assert rows["theta.distance"][k] == pytest.approx(
+        off @ np.linalg.inv(bound[:2, :2]) @ off, rel=1e-9
+    )
     sources = model.expected_counts(TRUTH)
     estimated = model.expected_counts(estimate.params[:2])
     assert rows["lambda"][k] == pytest.approx(np.mean(counts - estimated), rel=1e-9)
@@ -185,10 +205,17 @@ def test_a_frame_of_a_noise_study_is_an_ordinary_fit(tmp_path: Path) -> None:
 def test_cells_are_sums_over_frames(tmp_path: Path) -> None:
     study = levels(tmp_path / "n.ecsv", replicates=6, flux=[500.0, 2000.0], exposure=[2.0])
     cells, rows = study.cells, study.replicates
-    assert sorted(set(zip(cells["background"], cells["flux"], strict=True))) == [(0.5, 500), (0.5, 2000), (50, 500), (50, 2000)]
+    assert sorted(set(zip(cells["background"], cells["flux"], strict=True))) == [
+        (0.5, 500),
+        (0.5, 2000),
+        (50, 500),
+        (50, 2000),
+    ]
     assert set(cells["parameter"]) == {"theta", "f_ux", "g_vy", "background"}
     mine = (rows["background"] == 50) & (rows["flux"] == 500)
-    (at,) = np.flatnonzero((cells["background"] == 50) & (cells["flux"] == 500) & (cells["parameter"] == "g_vy"))
+    (at,) = np.flatnonzero(
+        (cells["background"] == 50) & (cells["flux"] == 500) & (cells["parameter"] == "g_vy")
+    )
     estimates = rows["g_vy.estimate"][mine]
     assert cells["frames"][at] == 6 == mine.sum()
     assert cells["bias"][at] == pytest.approx(estimates.mean() - TRUTH[1])
@@ -204,10 +231,14 @@ def test_cells_are_sums_over_frames(tmp_path: Path) -> None:
 
 def test_draws_agree_with_laplace(tmp_path: Path) -> None:
     """On bright sources the posterior is nearly normal: means agree within the errors of 1,000 draws, widths within 10 %."""
-    laplace, drawn = (levels(tmp_path / f"{m}.ecsv", method=m, replicates=2) for m in ("laplace", "mcmc"))
+    laplace, drawn = (
+        levels(tmp_path / f"{m}.ecsv", method=m, replicates=2) for m in ("laplace", "mcmc")
+    )
     for name in laplace.parameter_names:
         one, other = laplace.replicates, drawn.replicates
-        assert np.all(np.abs(one[f"{name}.estimate"] - other[f"{name}.estimate"]) < 0.3 * one[f"{name}.sd"])
+        assert np.all(
+            np.abs(one[f"{name}.estimate"] - other[f"{name}.estimate"]) < 0.3 * one[f"{name}.sd"]
+        )
         assert other[f"{name}.sd"] == pytest.approx(one[f"{name}.sd"], rel=0.1)
 
 
@@ -226,7 +257,9 @@ def test_draws_agree_with_laplace(tmp_path: Path) -> None:
         ({"workers": 0}, "workers"),
     ],
 )
-def test_studies_that_cannot_be_are_refused(tmp_path: Path, options: dict[str, Any], words: str) -> None:
+def test_studies_that_cannot_be_are_refused(
+    tmp_path: Path, options: dict[str, Any], words: str
+) -> None:
     with pytest.raises(InputError, match=words):
         levels(tmp_path / "n.ecsv", **options)
     with pytest.raises(InputError, match="folds"):
@@ -236,7 +269,15 @@ def test_studies_that_cannot_be_are_refused(tmp_path: Path, options: dict[str, A
 def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
     """A source of one photon over 1,000 counts a pixel determines nothing."""
     study = bf.noise_study(
-        tiny(), TRUTH, 1000.0, flux=[1.0, 1e5], replicates=2, path=tmp_path / "n.ecsv", seed=1, workers=1, progress=False
+        tiny(),
+        TRUTH,
+        1000.0,
+        flux=[1.0, 1e5],
+        replicates=2,
+        path=tmp_path / "n.ecsv",
+        seed=1,
+        workers=1,
+        progress=False,
     )
     whole = study.cells["parameter"] == "theta"
     assert study.cells["failed"][whole].tolist() == [2, 0]
@@ -248,7 +289,7 @@ def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
     assert plots.png(plots.noise_plot(study)).startswith(b"\x89PNG")
 
 
-# ------------------------------------------------------------------------------------------------------------- resuming, executors
+# --------------------------------------------------------------------------------------------------
 
 
 def test_an_interrupted_study_goes_on_bit_for_bit(tmp_path: Path) -> None:
@@ -311,10 +352,10 @@ def test_a_pool_gives_the_same_bits_and_gets_the_study_once_a_worker(tmp_path: P
 
 ORPHAN = """
 import os, signal
-from bayesfred.analysis import tasks
+from bayesfred.analysis import executor
 
 if __name__ == "__main__":
-    with tasks._executor(None, 2) as pool:
+    with executor._executor(None, 2) as pool:
         print(pool.submit(os.getpid).result(), flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -324,7 +365,9 @@ def test_the_processes_of_a_pool_end_with_a_study_that_is_killed(tmp_path: Path)
     script = tmp_path / "orphan.py"
     script.write_text(ORPHAN, encoding="utf-8")
     # returns when nobody has the pipes open any more
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == -signal.SIGKILL
     assert done.stdout.strip().isdigit()
 
@@ -337,7 +380,7 @@ class Forgetful:
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> Future[Any]:
         if self.misses:
-            tasks._studies.clear()
+            executor._studies.clear()
         self.misses -= bool(self.misses)
         future: Future[Any] = Future()
         future.set_result(function(args[0], args[1] if self.misses == 0 else None, args[2]))
@@ -378,7 +421,7 @@ def test_what_is_finished_is_kept_when_workers_die(tmp_path: Path) -> None:
 
 
 def test_answers_say_what_is_lacking_or_failed() -> None:
-    assert tasks.answer("unknown", None, 0)[1:] == (None, None)
+    assert executor.answer("unknown", None, 0)[1:] == (None, None)
 
     class Broken:
         columns = ("x",)
@@ -389,7 +432,7 @@ def test_answers_say_what_is_lacking_or_failed() -> None:
         def task(self, k: int) -> list[float]:
             raise ValueError("two\nlines")
 
-    answer = tasks.answer("broken", Broken(), 0)
+    answer = executor.answer("broken", Broken(), 0)
     assert isinstance(answer, Answer)
     assert answer[1:] == (None, "ValueError: two\\nlines")
 
@@ -427,7 +470,12 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(tmp_path: Path) 
     script.write_text(CLUSTER, encoding="utf-8")
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     done = subprocess.run(
-        [sys.executable, script, tmp_path / "there.ecsv"], env=env, capture_output=True, text=True, timeout=600, check=False
+        [sys.executable, script, tmp_path / "there.ecsv"],
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "killed" in done.stdout
@@ -435,23 +483,37 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(tmp_path: Path) 
     assert lines(tmp_path / "here.ecsv") == lines(tmp_path / "there.ecsv")
 
 
-# --------------------------------------------------------------------------------------------------------------------- calibration
+# --------------------------------------------------------------------------------------------------
 
 TIGHT = 1.5e-4  # scale of a prior about as wide as what the frame says
 
 
 def small(
-    background: float = 2.0, flux: float = 1000.0, widen: float = 1.0, conserve_flux: bool = True, free: bool = False
+    background: float = 2.0,
+    flux: float = 1000.0,
+    widen: float = 1.0,
+    conserve_flux: bool = True,
+    free: bool = False,
 ) -> bf.Posterior:
     """Nine sources and four terms, two of them with priors that matter."""
-    distortion = bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0), (1, 0, 0, 1)], g_terms=[(0, 1, 0, 1), (0, 1, 1, 0)])
-    model = bf.ForwardModel(
-        bf.Detector((41, 41)), bf.SourceCatalog.grid(3, 12.0, flux), bf.GaussianPSF(2.0), distortion, conserve_flux=conserve_flux
+    distortion = bf.PolynomialDistortion(
+        f_terms=[(1, 0, 1, 0), (1, 0, 0, 1)], g_terms=[(0, 1, 0, 1), (0, 1, 1, 0)]
     )
-    prior = {name: stats.norm(0.0, widen * TIGHT * np.sqrt(1000.0 / flux)) for name in ("f_vx", "g_uy")}
+    model = bf.ForwardModel(
+        bf.Detector((41, 41)),
+        bf.SourceCatalog.grid(3, 12.0, flux),
+        bf.GaussianPSF(2.0),
+        distortion,
+        conserve_flux=conserve_flux,
+    )
+    prior = {
+        name: stats.norm(0.0, widen * TIGHT * np.sqrt(1000.0 / flux)) for name in ("f_vx", "g_uy")
+    }
     prior["background"] = stats.gamma(4.0, scale=background / 4.0)
     frame = model.expected_counts(np.zeros(4), background)
-    return bf.Posterior(model, frame, prior=prior, nuisances=bf.Nuisances("free" if free else "fixed"))
+    return bf.Posterior(
+        model, frame, prior=prior, nuisances=bf.Nuisances("free" if free else "fixed")
+    )
 
 
 @dataclass(frozen=True)
@@ -465,8 +527,12 @@ class TooSure(sbc._Calibration):
 
 
 WRONG: dict[str, Callable[[int], sbc._Calibration]] = {
-    "a prior twice too wide": lambda seed: sbc._Calibration(small(), small(widen=2.0), "mcmc", seed),
-    "the determinant left out": lambda seed: sbc._Calibration(small(), small(conserve_flux=False), "mcmc", seed),
+    "a prior twice too wide": lambda seed: sbc._Calibration(
+        small(), small(widen=2.0), "mcmc", seed
+    ),
+    "the determinant left out": lambda seed: sbc._Calibration(
+        small(), small(conserve_flux=False), "mcmc", seed
+    ),
     "error bars scaled by 0.9": lambda seed: TooSure(small(), small(), "mcmc", seed),
 }
 
@@ -488,14 +554,22 @@ def test_truth_is_ranked_among_the_draws(tmp_path: Path) -> None:
     likelihood = fit.log_prob(draws) - fit.log_prior(draws)
     assert row["log_likelihood.mean"] == pytest.approx(likelihood.mean(), rel=1e-12)
     f, g = posterior.model.distortion.displacement(truth[:4], 14.0, 8.0, 14.0, 8.0)
-    assert (row["f(+14, +8).truth"], row["g(+14, +8).truth"]) == pytest.approx((float(f), float(g)), rel=1e-12)
+    assert (row["f(+14, +8).truth"], row["g(+14, +8).truth"]) == pytest.approx(
+        (float(f), float(g)), rel=1e-12
+    )
     assert np.random.default_rng(for_ranks).random(1).size == 1
 
 
 def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> None:
     """Where hardly a background photon is, the normal approximation reaches below zero; these draws are none."""
     dark = bf.calibrate_posterior(
-        small(background=0.001), replicates=3, method="laplace", path=tmp_path / "l.ecsv", seed=1, workers=1, progress=False
+        small(background=0.001),
+        replicates=3,
+        method="laplace",
+        path=tmp_path / "l.ecsv",
+        seed=1,
+        workers=1,
+        progress=False,
     )
     assert dark.n == 3
     rows = files.read_table(tmp_path / "l.ecsv").columns
@@ -525,7 +599,12 @@ def test_right_error_bars_are_found_right_and_wrong_ones_wrong(tmp_path: Path) -
 def test_frames_without_a_posterior_are_no_calibration(tmp_path: Path) -> None:
     """Of sources of a photon nothing can be found."""
     result = bf.calibrate_posterior(
-        small(background=100.0, flux=1.0), replicates=3, path=tmp_path / "s.ecsv", seed=1, workers=1, progress=False
+        small(background=100.0, flux=1.0),
+        replicates=3,
+        path=tmp_path / "s.ecsv",
+        seed=1,
+        workers=1,
+        progress=False,
     )
     assert not result.calibrated
     assert (result.n, result.n_failed) == (0, 3)
@@ -535,13 +614,17 @@ def test_frames_without_a_posterior_are_no_calibration(tmp_path: Path) -> None:
 
 def test_calibrations_that_cannot_be_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="fitted"):
-        bf.calibrate_posterior(small(), fitted=everything(tiny(), bf.PoissonNoise()), path=tmp_path / "s.ecsv", seed=1)
+        bf.calibrate_posterior(
+            small(), fitted=everything(tiny(), bf.PoissonNoise()), path=tmp_path / "s.ecsv", seed=1
+        )
     folding = bf.Posterior(tiny(), np.ones((31, 31)), prior={"f_ux": stats.norm(-0.5, 0.01)})
-    result = bf.calibrate_posterior(folding, replicates=2, path=tmp_path / "s.ecsv", seed=1, workers=1, progress=False)
+    result = bf.calibrate_posterior(
+        folding, replicates=2, path=tmp_path / "s.ecsv", seed=1, workers=1, progress=False
+    )
     assert "fold" in result.message
 
 
-# --------------------------------------------------------------------------------------------------------------------- the command
+# --------------------------------------------------------------------------------------------------
 
 RUN = """
 [frame]
@@ -578,7 +661,7 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool
 
     def run(text: str, **options: Any) -> bool:
         Path("run.toml").write_text(RUN + text, encoding="utf-8")
-        return bf.runs.study("run.toml", **{"workers": 1, **options})
+        return bf.commands.study("run.toml", **{"workers": 1, **options})
 
     return run
 
@@ -588,7 +671,10 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
     assert "8 frames, 0 failed" in capsys.readouterr().out
     table = files.read_table("chains/run.noise.ecsv")
     assert (table.meta["study"], table.columns["task"].size) == ("noise", 8)
-    assert sorted(set(files.read_table("chains/run.noise.summary.ecsv").columns["background"])) == [1.0, 10.0]
+    assert sorted(set(files.read_table("chains/run.noise.summary.ecsv").columns["background"])) == [
+        1.0,
+        10.0,
+    ]
     assert Path("chains/run.noise.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(InputError, match=r"run.noise.ecsv: exists"):
         study("replicates = 4\nbackground = [1, 10]\n")
@@ -596,7 +682,10 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
     assert study("replicates = 10\n", kind="sbc")
     assert "calibrated: 10 frames" in capsys.readouterr().out
     assert len(files.read_table("chains/run.sbc.summary.ecsv").columns["quantity"]) == 10
-    assert not study("replicates = 2\npath = 'faint.ecsv'\n[prior.f_ux]\ndistribution = 'norm'\nloc = -0.5\n", kind="sbc")
+    assert not study(
+        "replicates = 2\npath = 'faint.ecsv'\n[prior.f_ux]\ndistribution = 'norm'\nloc = -0.5\n",
+        kind="sbc",
+    )
     assert "not calibrated: no posterior of 2 frames (start: " in capsys.readouterr().out
 
 
@@ -610,7 +699,9 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
         ({}, "path = '../n.ecsv'\n", "study.path"),
     ],
 )
-def test_bad_input_is_one_line(study: Callable[..., bool], options: dict[str, bool], text: str, words: str) -> None:
+def test_bad_input_is_one_line(
+    study: Callable[..., bool], options: dict[str, bool], text: str, words: str
+) -> None:
     with pytest.raises(InputError, match=words) as refused:
         study(text, **options)
     assert "\n" not in str(refused.value)
@@ -621,7 +712,7 @@ def test_a_study_needs_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     Path("run.toml").write_text(RUN[: RUN.index("[simulation]")], encoding="utf-8")
     with pytest.raises(InputError, match="simulation: no such section"):
-        bf.runs.study("run.toml")
+        bf.commands.study("run.toml")
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -632,11 +723,19 @@ def test_a_scheduler_that_is_not_there(study: Callable[..., bool]) -> None:
     assert "\n" not in str(refused.value)
 
 
-def test_an_interrupt_keeps_everything(study: Callable[..., bool], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_an_interrupt_keeps_everything(
+    study: Callable[..., bool], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """A terminal's Ctrl-C, which goes to the pool's processes too."""
     (tmp_path / "run.toml").write_text(RUN + "replicates = 50000\n", encoding="utf-8")
     table = tmp_path / "chains" / "run.noise.ecsv"
-    process = subprocess.Popen([*STUDY, "--workers", "2"], cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        [*STUDY, "--workers", "2"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     while not (table.exists() and lines(table)) and process.poll() is None:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
@@ -649,7 +748,7 @@ def test_an_interrupt_keeps_everything(study: Callable[..., bool], capsys: pytes
     assert f"{n + 2} frames" in capsys.readouterr().out
 
 
-# -------------------------------------------------------------------------------------------------------------------- the long run
+# --------------------------------------------------------------------------------------------------
 
 N = 1000
 CASES: dict[str, dict[str, Any]] = {
@@ -663,7 +762,9 @@ CASES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_error_bars_hold(tmp_path: Path, case: str) -> None:
     """Of every parameter: 68 and 95 % intervals and the mean pull within three standard errors; of every quantity: the verdict."""
-    result = bf.calibrate_posterior(small(**CASES[case]), replicates=N, path=tmp_path / "s.ecsv", seed=1, progress=False)
+    result = bf.calibrate_posterior(
+        small(**CASES[case]), replicates=N, path=tmp_path / "s.ecsv", seed=1, progress=False
+    )
     assert result.calibrated, result.message
     assert result.n_failed == 0
     parameters = slice(0, 5)
@@ -682,10 +783,21 @@ def test_wrong_error_bars_are_caught(tmp_path: Path, wrong: str) -> None:
 def paper_levels(path: Path) -> bf.NoiseStudy:
     """The paper's frame and the coefficients of its Table 2 at eight backgrounds."""
     model = bf.ForwardModel(
-        bf.Detector((505, 505)), bf.SourceCatalog.grid(9, 50.0, 1e5), bf.GaussianPSF(10.0), bf.PolynomialDistortion.mirrored()
+        bf.Detector((505, 505)),
+        bf.SourceCatalog.grid(9, 50.0, 1e5),
+        bf.GaussianPSF(10.0),
+        bf.PolynomialDistortion.mirrored(),
     )
     theta = [0.0, 2e-6, 0.0, -2e-6, 1e-6, 2e-6, 0.0, 3e-6, 0.0, 1e-6, 1e-6, -1e-6]
-    return bf.noise_study(model, theta, np.geomspace(0.5, 500.0, 8).tolist(), replicates=50, path=path, seed=1, progress=False)
+    return bf.noise_study(
+        model,
+        theta,
+        np.geomspace(0.5, 500.0, 8).tolist(),
+        replicates=50,
+        path=path,
+        seed=1,
+        progress=False,
+    )
 
 
 def attains_the_bound(cells: dict[str, NDArray[Any]]) -> bool:
@@ -701,7 +813,10 @@ def test_the_papers_noise_study_attains_the_bound(tmp_path: Path) -> None:
     study = paper_levels(tmp_path / "n.ecsv")
     assert study.cells["failed"].sum() == 0
     assert attains_the_bound(study.cells), study.message
-    coverage = {key: study.cells[key][study.cells["parameter"] == "theta"].mean() for key in ("coverage_68", "coverage_95")}
+    coverage = {
+        key: study.cells[key][study.cells["parameter"] == "theta"].mean()
+        for key in ("coverage_68", "coverage_95")
+    }
     # 400 frames of 12 coefficients, at worst all alike
     assert coverage["coverage_68"] == pytest.approx(0.68, abs=3 * np.sqrt(0.68 * 0.32 / 400))
     assert coverage["coverage_95"] == pytest.approx(0.95, abs=3 * np.sqrt(0.95 * 0.05 / 400))

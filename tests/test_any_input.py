@@ -1,8 +1,8 @@
 """Whatever is put before `bayesfred fit`: a result, or one clean line; never a traceback, a warning or a lost file.
 
-Hypothesis makes folders of a run file, a catalogue and a frame: a small problem that can be fitted, spoilt in some places. Runs
-that are sound but long, by their own settings, are left out. The default run makes the same few examples every time; the long
-one thousands of new ones.
+Hypothesis makes folders of a run file, a catalogue and a frame: a small problem that can be fitted,
+spoilt in some places. Runs that are sound but long, by their own settings, are left out. The
+default run makes the same few examples every time; the long one thousands of new ones.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from typer.testing import CliRunner
 import bayesfred as bf
 from bayesfred.cli import app
 from bayesfred.errors import InputError
-from bayesfred.inference.chainfile import open_chain
+from bayesfred.sampling.chainfile import open_chain
 from bayesfred.settings import read_settings
 
 
@@ -57,7 +57,12 @@ def sound_counts() -> NDArray[np.float64]:
     """A frame of these stars."""
     stars = bf.SourceCatalog(*np.array(STARS[1:], dtype=float).T)
     terms = bf.PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
-    return bf.simulate(bf.ForwardModel(bf.Detector((24, 24)), stars, bf.GaussianPSF(1.5), terms), [1e-3, -1e-3], 3.0, seed=1)
+    return bf.simulate(
+        bf.ForwardModel(bf.Detector((24, 24)), stars, bf.GaussianPSF(1.5), terms),
+        [1e-3, -1e-3],
+        3.0,
+        seed=1,
+    )
 
 
 # Keys and values that a section may have, so that sound runs of many kinds are among the examples.
@@ -67,18 +72,31 @@ PRIOR = st.fixed_dictionaries(
     {"distribution": st.sampled_from(FAMILIES)},
     optional={key: st.floats(1e-3, 10) | FINITE for key in ("loc", "scale", "a", "b", "s")},
 )
-PLACES = ["chains/run.h5", "link/run.h5", "link.h5", "../precious/new.h5", "precious.h5", "{root}/x.h5", "./a b.h5", "<b>'.h5"]
+PLACES = [
+    "chains/run.h5",
+    "link/run.h5",
+    "link.h5",
+    "../precious/new.h5",
+    "precious.h5",
+    "{root}/x.h5",
+    "./a b.h5",
+    "<b>'.h5",
+]
 SOUND: dict[str, dict[str, SearchStrategy[Any]]] = {
     "frame": {
         "gain": st.floats(0.1, 100),
         "pedestal": st.integers(-100, 0),
         "saturation": st.floats(1, 1e5),
-        "sigma_clip": st.booleans(),
+        "reject_outliers": st.booleans(),
     },
     "catalogue": {"flux": st.sampled_from(["x", "flux"]), "x": st.just("y")},
     "detector": {"pixel": st.sampled_from(["impulse", "box"]), "binning": st.integers(1, 4)},
     "psf": {"sigma": st.floats(0.5, 5) | st.floats(1e-3, 100)},
-    "distortion": {"f_terms": st.lists(st.tuples(*[st.integers(0, 2)] * 2, *[st.integers(0, 1)] * 2).map(list), max_size=2)},
+    "distortion": {
+        "f_terms": st.lists(
+            st.tuples(*[st.integers(0, 2)] * 2, *[st.integers(0, 1)] * 2).map(list), max_size=2
+        )
+    },
     "model": {"conserve_flux": st.booleans(), "tolerance": st.floats(0, 0.999)},
     "noise": {"kind": st.sampled_from(["poisson", "background"]), "read_noise": st.floats(0, 100)},
     "nuisances": {
@@ -103,7 +121,24 @@ TEXTS = st.text(max_size=20) | st.sampled_from(ODD)
 NUMBERS = st.one_of(
     st.floats(),
     st.integers(),
-    st.sampled_from([0, -1, 1, 0.5, 2**31, 2**53, 2**63, 10**30, 10**400, 1e-300, 1e300, -0.0, float("nan"), float("inf")]),
+    st.sampled_from(
+        [
+            0,
+            -1,
+            1,
+            0.5,
+            2**31,
+            2**53,
+            2**63,
+            10**30,
+            10**400,
+            1e-300,
+            1e300,
+            -0.0,
+            float("nan"),
+            float("inf"),
+        ]
+    ),
 )
 VALUES = st.recursive(
     st.one_of(TEXTS, NUMBERS, st.booleans(), st.just(date(2000, 1, 1))),
@@ -117,7 +152,14 @@ def toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return '"' + "".join(c if c.isascii() and c.isprintable() and c not in '\\"' else f"\\U{ord(c):08x}" for c in value) + '"'
+        return (
+            '"'
+            + "".join(
+                c if c.isascii() and c.isprintable() and c not in '\\"' else f"\\U{ord(c):08x}"
+                for c in value
+            )
+            + '"'
+        )
     if isinstance(value, dict):
         return "{" + ", ".join(f"{toml(k)} = {toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
@@ -132,13 +174,17 @@ def run_files(draw: DrawFn, suffix: str, *, spoil: bool) -> bytes:
     run["frame"]["path"] = f"frame{suffix}"
     for _ in range(draw(st.integers(1, 3)) if spoil else 0):
         section = draw(st.sampled_from([*SOUND]))
-        kind = draw(st.sampled_from([*["sound"] * 8, "value", "value", "key", "section", "without"]))
+        kind = draw(
+            st.sampled_from([*["sound"] * 8, "value", "value", "key", "section", "without"])
+        )
         if kind == "sound":
             key = draw(st.sampled_from([*SOUND[section]]))
             run.setdefault(section, {})[key] = draw(SOUND[section][key])
         elif kind == "value":
             table = run.setdefault(section, {})
-            table[draw(st.sampled_from([*SOUND[section], "path", "name", "magnitude", "zero_point"]))] = draw(VALUES)
+            table[
+                draw(st.sampled_from([*SOUND[section], "path", "name", "magnitude", "zero_point"]))
+            ] = draw(VALUES)
         elif kind == "key":
             run.setdefault(section, {})[draw(TEXTS)] = draw(VALUES)
         elif kind == "section":
@@ -160,9 +206,15 @@ def catalogues(draw: DrawFn, *, spoil: bool) -> bytes:
     rows = [list(row) for row in STARS]
     for _ in range(draw(st.integers(1, 3)) if spoil else 0):
         row = draw(st.integers(0, len(rows) - 1)) if rows else 0
-        kind = draw(st.sampled_from(["far", "far", "far", "number", "number", "cell", "row", "again", "drop", "short"]))
+        kind = draw(
+            st.sampled_from(
+                ["far", "far", "far", "number", "number", "cell", "row", "again", "drop", "short"]
+            )
+        )
         if kind == "far":
-            rows.append([str(draw(st.floats(-30, 30) | st.floats(-1e3, 1e3))) for _ in "xy"] + ["5000"])
+            rows.append(
+                [str(draw(st.floats(-30, 30) | st.floats(-1e3, 1e3))) for _ in "xy"] + ["5000"]
+            )
         elif kind == "row":
             rows.append(draw(st.lists(TEXTS, max_size=5)))
         elif kind == "again" and rows:
@@ -174,7 +226,11 @@ def catalogues(draw: DrawFn, *, spoil: bool) -> bytes:
             if kind == "short":
                 del rows[row][column]
             else:
-                rows[row][column] = draw(st.floats(-20, 20).map(str) if kind == "number" else st.one_of(TEXTS, NUMBERS.map(str)))
+                rows[row][column] = draw(
+                    st.floats(-20, 20).map(str)
+                    if kind == "number"
+                    else st.one_of(TEXTS, NUMBERS.map(str))
+                )
     return "".join(",".join(row) + "\n" for row in rows).encode("utf-8", "surrogatepass")
 
 
@@ -183,14 +239,32 @@ def images(draw: DrawFn, *, spoil: bool) -> NDArray[Any]:
     """A frame's array, perhaps with other pixels, shape or type."""
     counts: NDArray[Any] = sound_counts().copy()
     for _ in range(draw(st.integers(1, 2)) if spoil else 0):
-        kind = draw(st.sampled_from(["pixels", *["whole"] * 3, "constant", "shape", *["crop"] * 2, "type", *["scale"] * 2]))
+        kind = draw(
+            st.sampled_from(
+                [
+                    "pixels",
+                    *["whole"] * 3,
+                    "constant",
+                    "shape",
+                    *["crop"] * 2,
+                    "type",
+                    *["scale"] * 2,
+                ]
+            )
+        )
         if kind in ("pixels", "whole") and counts.size and counts.dtype.kind == "f":
             places = draw(st.lists(st.integers(0, counts.size - 1), min_size=1, max_size=20))
             whole = st.integers(0, 1000) | st.sampled_from([65535, 10**6, 2**50, np.nan])
             counts = counts.copy()
-            counts.flat[places] = draw(whole if kind == "whole" else st.floats() | st.sampled_from([np.inf, -1.0, 0.5, 2.0**60]))
+            counts.flat[places] = draw(
+                whole
+                if kind == "whole"
+                else st.floats() | st.sampled_from([np.inf, -1.0, 0.5, 2.0**60])
+            )
         elif kind == "constant":
-            counts = np.full(counts.shape, draw(st.sampled_from([0.0, 1.0, 65535.0, np.nan, -1.0, 1e18, 1e300])))
+            counts = np.full(
+                counts.shape, draw(st.sampled_from([0.0, 1.0, 65535.0, np.nan, -1.0, 1e18, 1e300]))
+            )
         elif kind == "shape":
             counts = np.resize(counts, draw(st.lists(st.integers(0, 30), max_size=3).map(tuple)))
         elif kind == "crop" and counts.ndim == 2:
@@ -198,7 +272,9 @@ def images(draw: DrawFn, *, spoil: bool) -> NDArray[Any]:
         elif kind == "type" and counts.dtype.kind != "S":
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                counts = counts.astype(draw(st.sampled_from(["u1", "i2", "u2", "i8", "f4", ">f8", "c16", "?", "S3"])))
+                counts = counts.astype(
+                    draw(st.sampled_from(["u1", "i2", "u2", "i8", "f4", ">f8", "c16", "?", "S3"]))
+                )
         elif kind == "scale" and counts.dtype.kind == "f":
             with np.errstate(all="ignore"):
                 counts = np.rint(counts * draw(st.floats(0, 1e6)))
@@ -216,7 +292,9 @@ def stored(image: NDArray[Any], suffix: str, folder: Path) -> bytes:
             with h5py.File(path, "w") as file:
                 file["counts"] = image
         elif suffix == ".fits.fz":
-            fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(image, quantize_level=0.0)]).writeto(path)
+            fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(image, quantize_level=0.0)]).writeto(
+                path
+            )
         else:
             fits.PrimaryHDU(image).writeto(path)
     content = path.read_bytes()
@@ -237,7 +315,13 @@ def damaged(draw: DrawFn, content: bytes) -> bytes:
         return content + content
     if kind == "card" and b"NAXIS" in content:
         value = draw(NUMBERS)
-        start = content.index(draw(st.sampled_from([card for card in (b"NAXIS ", b"NAXIS1", b"BITPIX") if card in content])))
+        start = content.index(
+            draw(
+                st.sampled_from(
+                    [card for card in (b"NAXIS ", b"NAXIS1", b"BITPIX") if card in content]
+                )
+            )
+        )
         return content[: start + 10] + f"{value!s:>20.20}".encode() + content[start + 30 :]
     return content[:place] + draw(st.binary(min_size=1, max_size=4)) + content[place + 1 :]
 
@@ -269,7 +353,10 @@ DRAWN = st.sampled_from([True, False, False, False])
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in sorted(folder.rglob("*"))}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None
+        for p in sorted(folder.rglob("*"))
+    }
 
 
 def is_short(run_file: Path) -> bool:
@@ -302,7 +389,11 @@ def check(files: Files, drawn: bool) -> None:
         assume(is_short(here / "run.toml"))
         before = snapshot(root)
         draw = Figure.savefig if drawn else lambda figure, target, **_: target.write(b"no picture")
-        with contextlib.chdir(here), patch.object(Figure, "savefig", draw), warnings.catch_warnings(record=True) as warned:
+        with (
+            contextlib.chdir(here),
+            patch.object(Figure, "savefig", draw),
+            warnings.catch_warnings(record=True) as warned,
+        ):
             warnings.simplefilter("always")
             result = CliRunner().invoke(app, ["fit", "run.toml"], env={"BAYESFRED_DATA": None})
         after = snapshot(root)
@@ -337,7 +428,13 @@ def test_a_result_or_one_line(files: Files, drawn: bool) -> None:
 
 
 @pytest.mark.long
-@settings(max_examples=2000, deadline=None, database=None, print_blob=True, suppress_health_check=[*HealthCheck])
+@settings(
+    max_examples=2000,
+    deadline=None,
+    database=None,
+    print_blob=True,
+    suppress_health_check=[*HealthCheck],
+)
 @given(inputs(), DRAWN)
 def test_a_result_or_one_line_thousands_of_times(files: Files, drawn: bool) -> None:
     check(files, drawn)

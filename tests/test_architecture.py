@@ -1,6 +1,7 @@
 """The shape of the package, read from its source: who imports whom, what stays in which room, what is documented.
 
-Every rule is a function of source text, so that each is also shown to fail on a text that breaks it.
+Every rule is a function of source text, so that each is also shown to fail on a text that breaks
+it.
 """
 
 import ast
@@ -29,16 +30,23 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-SOURCES = {module_name(path): path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+SOURCES = {
+    module_name(path): path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))
+}
 PACKAGES = {module_name(path) for path in PACKAGE.rglob("__init__.py")}
 
 
 def test_there_is_something_to_read() -> None:
-    assert {"bayesfred", "bayesfred.errors", "bayesfred.imaging.kernels.maps", "bayesfred.cli"} <= set(SOURCES)
+    assert {
+        "bayesfred",
+        "bayesfred.errors",
+        "bayesfred.imaging.kernels.geometry",
+        "bayesfred.cli",
+    } <= set(SOURCES)
     assert {"bayesfred", "bayesfred.imaging", "bayesfred.imaging.kernels"} <= PACKAGES
 
 
-# ------------------------------------------------------------------------------------------------------------------- imports
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,11 @@ def imports(source: str, module: str) -> list[Import]:
         for child in ast.iter_child_nodes(node):
             for name in imported(child, module):
                 found.append(Import(name, child.lineno, in_function))  # type: ignore[attr-defined]
-            visit(child, in_function or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda))
+            visit(
+                child,
+                in_function
+                or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda),
+            )
 
     visit(ast.parse(source), False)
     return found
@@ -72,7 +84,9 @@ def imported(node: ast.AST, module: str) -> Iterator[str]:
         base = node.module or ""
         if node.level:
             here = module.split(".") if module in PACKAGES else module.split(".")[:-1]
-            base = ".".join([*here[: len(here) - node.level + 1], *([node.module] if node.module else [])])
+            base = ".".join(
+                [*here[: len(here) - node.level + 1], *([node.module] if node.module else [])]
+            )
         for alias in node.names:
             full = f"{base}.{alias.name}"
             yield full if full in SOURCES else base
@@ -87,18 +101,21 @@ def within_package(names: Iterable[str]) -> list[str]:
     return [f"bayesfred.{name}" for name in names]
 
 
-# What each room may import from the package besides itself; the order is the direction of the imports.
-MAY_IMPORT = {
+# What each room may import from the package besides itself; the order is the direction of the
+# imports.
+BELOW = {
     "errors": (),
+    "io": ("errors",),
     "imaging": ("errors",),
-    "inference": ("errors", "imaging"),
-    "analysis": ("errors", "imaging", "inference", "files"),  # a study's rows are kept on disk as they come
-    "reporting": ("errors", "imaging", "inference", "analysis"),
-    "files": ("errors",),
     "settings": ("errors",),
-    "assembly": ("errors", "imaging", "inference", "files", "settings"),
-    "runs": ("errors", "imaging", "inference", "analysis", "reporting", "files", "settings", "assembly"),
+    "model": ("errors", "imaging"),
+    "optimize": ("errors", "imaging", "model"),
+    "sampling": ("errors", "io", "imaging", "model", "optimize"),
+    "analysis": ("errors", "io", "imaging", "model", "optimize", "sampling"),
+    "reporting": ("errors", "io", "imaging", "model", "optimize", "sampling", "analysis"),
+    "build": ("errors", "io", "imaging", "model", "settings"),
 }
+MAY_IMPORT = {**BELOW, "commands": tuple(BELOW)}
 
 
 def wrong_way(source: str, module: str) -> list[str]:
@@ -107,9 +124,11 @@ def wrong_way(source: str, module: str) -> list[str]:
     if module == "bayesfred":
         return sorted(names)
     if module == "bayesfred.cli":
-        return sorted(names - {"bayesfred", "bayesfred.errors", "bayesfred.runs"})
+        return sorted(names - {"bayesfred", "bayesfred.errors", "bayesfred.commands"})
     room = module.split(".")[1]
-    return sorted(name for name in names if not is_within(name, within_package((room, *MAY_IMPORT[room]))))
+    return sorted(
+        name for name in names if not is_within(name, within_package((room, *MAY_IMPORT[room])))
+    )
 
 
 @pytest.mark.parametrize("module", SOURCES)
@@ -120,16 +139,16 @@ def test_imports_run_one_way(module: str) -> None:
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("bayesfred.imaging.psf", "from bayesfred.inference.noise import PoissonNoise"),
-        ("bayesfred.imaging.psf", "from ..inference import noise"),
-        ("bayesfred.inference.noise", "import bayesfred.analysis.diagnostics"),
+        ("bayesfred.imaging.psf", "from bayesfred.model.noise import PoissonNoise"),
+        ("bayesfred.imaging.psf", "from ..model import noise"),
+        ("bayesfred.model.noise", "import bayesfred.analysis.diagnostics"),
         ("bayesfred.analysis.diagnostics", "from bayesfred.reporting import plots"),
-        ("bayesfred.reporting.plots", "from bayesfred.runs import Result"),
-        ("bayesfred.runs", "def f():\n    from bayesfred import cli"),
-        ("bayesfred.files", "from bayesfred import settings"),
+        ("bayesfred.reporting.plots", "from bayesfred.commands import Result"),
+        ("bayesfred.commands", "def f():\n    from bayesfred import cli"),
+        ("bayesfred.io.files", "from bayesfred import settings"),
         ("bayesfred.settings", "from bayesfred.imaging.detector import PIXELS"),
-        ("bayesfred.errors", "from bayesfred import files"),
-        ("bayesfred.cli", "from bayesfred.inference.sampling import sample"),
+        ("bayesfred.errors", "from bayesfred.io import files"),
+        ("bayesfred.cli", "from bayesfred.sampling.sampler import sample"),
         ("bayesfred.imaging.psf", "import bayesfred as bf"),
         ("bayesfred", "from bayesfred.errors import InputError"),
     ],
@@ -162,29 +181,46 @@ def cycle(graph: Mapping[str, Iterable[str]]) -> list[str]:
 
 
 def import_graph(sources: Mapping[str, str]) -> dict[str, set[str]]:
-    return {name: {i.module for i in imports(source, name)} & set(sources) for name, source in sources.items()}
+    return {
+        name: {i.module for i in imports(source, name)} & set(sources)
+        for name, source in sources.items()
+    }
 
 
 def test_no_import_cycles() -> None:
     graph = import_graph(SOURCES)
-    assert graph["bayesfred.inference.sampling"] >= {"bayesfred.inference.ensembles", "bayesfred.errors"}
+    assert graph["bayesfred.sampling.sampler"] >= {
+        "bayesfred.sampling.ensembles",
+        "bayesfred.errors",
+    }
     assert cycle(graph) == []
 
 
 def test_cycle_is_seen() -> None:
     sources = {
-        "bayesfred.runs": "from bayesfred.inference import moves, noise",
-        "bayesfred.inference.moves": "from bayesfred.inference.sampling import sample",
-        "bayesfred.inference.sampling": "from . import moves",
-        "bayesfred.inference.noise": "import math",
+        "bayesfred.commands": "from bayesfred.model import moves, noise",
+        "bayesfred.sampling.moves": "from bayesfred.sampling.sampler import sample",
+        "bayesfred.sampling.sampler": "from . import moves",
+        "bayesfred.model.noise": "import math",
     }
-    assert set(cycle(import_graph(sources))) == {"bayesfred.inference.moves", "bayesfred.inference.sampling"}
+    assert set(cycle(import_graph(sources))) == {
+        "bayesfred.sampling.moves",
+        "bayesfred.sampling.sampler",
+    }
 
 
 def hidden_imports(source: str, module: str) -> list[int]:
     """Lines where a function imports from the package, or a name is imported that only running the code tells."""
-    inside = [i.line for i in imports(source, module) if i.in_function and is_within(i.module, ["bayesfred"])]
-    return inside + [node.lineno for node in calls(source) if called(node).split(".")[-1] in ("import_module", "__import__")]
+    inside = [
+        i.line
+        for i in imports(source, module)
+        if i.in_function and is_within(i.module, ["bayesfred"])
+    ]
+    return inside + [
+        node.lineno
+        for node in calls(source)
+        if called(node).split(".")[-1] in ("import_module", "__import__")
+    ]
 
 
 def calls(source: str) -> Iterator[ast.Call]:
@@ -206,45 +242,47 @@ def test_package_imports_stand_at_the_top(module: str) -> None:
     [
         "def f():\n    from bayesfred.errors import InputError",
         "class C:\n    def f(self):\n        from ..imaging import psf",
-        "async def f():\n    import bayesfred.runs",
-        "import importlib\nimportlib.import_module('bayesfred.runs')",
-        "__import__('bayesfred.runs')",
+        "async def f():\n    import bayesfred.commands",
+        "import importlib\nimportlib.import_module('bayesfred.commands')",
+        "__import__('bayesfred.commands')",
     ],
 )
 def test_hidden_import_is_seen(source: str) -> None:
-    assert len(hidden_imports(source, "bayesfred.inference.noise")) == 1
+    assert len(hidden_imports(source, "bayesfred.model.noise")) == 1
 
 
-# -------------------------------------------------------------------------------------------------------------------- fences
+# --------------------------------------------------------------------------------------------------
 
 # The modules, or rooms, in which a package may be imported.
-KERNELS = ("imaging.kernels", "inference.kernels")
+KERNELS = ("imaging.kernels", "model.kernels")
 FENCES: dict[str, tuple[str, ...]] = {
-    "numba": (*KERNELS, "inference.posterior"),  # posterior reads the number of threads: see below
-    "llvmlite": ("imaging.kernels.elementary",),
-    "emcee": ("inference.moves", "inference.ensembles"),
-    "h5py": ("inference.chainfile", "inference.examine", "files"),
-    "arviz": ("analysis", "reporting.plots", "inference.chainfile"),
-    "arviz_base": ("analysis", "reporting.plots", "inference.chainfile"),
-    "arviz_stats": ("analysis", "reporting.plots", "inference.chainfile"),
-    "arviz_plots": ("analysis", "reporting.plots", "inference.chainfile"),
+    "numba": (*KERNELS, "model.posterior"),  # posterior reads the number of threads: see below
+    "llvmlite": ("imaging.kernels.fastmath",),
+    "emcee": ("sampling.moves", "sampling.ensembles"),
+    "h5py": ("sampling.chainfile", "io"),
+    "arviz": ("analysis", "reporting.plots", "sampling.chainfile"),
+    "arviz_base": ("analysis", "reporting.plots", "sampling.chainfile"),
+    "arviz_stats": ("analysis", "reporting.plots", "sampling.chainfile"),
+    "arviz_plots": ("analysis", "reporting.plots", "sampling.chainfile"),
     "matplotlib": ("reporting",),
     "corner": ("reporting",),
-    "astropy": ("files",),
+    "astropy": ("io",),
     "pydantic": ("settings",),
     "typer": ("cli",),
     "click": ("cli",),
     "jinja2": ("reporting.html",),
-    "filelock": ("inference.lock",),
+    "filelock": ("io.lock",),
     "dask": (),
-    "distributed": ("analysis.tasks",),
+    "distributed": ("analysis.executor",),
 }
 
 
 def outside_fence(source: str, module: str) -> list[str]:
     """Third-party packages that a module imports and should leave to another."""
     packages = {i.module.split(".")[0] for i in imports(source, module)}
-    return sorted(p for p in packages if p in FENCES and not is_within(module, within_package(FENCES[p])))
+    return sorted(
+        p for p in packages if p in FENCES and not is_within(module, within_package(FENCES[p]))
+    )
 
 
 @pytest.mark.parametrize("module", SOURCES)
@@ -254,35 +292,67 @@ def test_third_party_packages_stay_in_their_rooms(module: str) -> None:
 
 @pytest.mark.parametrize("package", FENCES)
 def test_package_outside_its_fence_is_seen(package: str) -> None:
-    for source in (f"import {package}.sub", f"from {package} import x", f"def f():\n    import {package}"):
+    for source in (
+        f"import {package}.sub",
+        f"from {package} import x",
+        f"def f():\n    import {package}",
+    ):
         assert outside_fence(source, "bayesfred.imaging.psf") == [package]
 
 
 def test_rooms_of_the_fences_exist() -> None:
     rooms = {room for places in FENCES.values() for room in within_package(places)}
-    assert [room for room in rooms if not any(is_within(module, [room]) for module in SOURCES)] == []
+    assert [
+        room for room in rooms if not any(is_within(module, [room]) for module in SOURCES)
+    ] == []
 
 
 def attributes(source: str, name: str) -> set[str]:
     """What a module uses of an imported one: the attributes of its name, and what it imports from it."""
     tree = ast.parse(source)
-    used = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and ast.unparse(n.value) == name}
-    return used | {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module == name for a in n.names}
+    used = {
+        n.attr
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Attribute) and ast.unparse(n.value) == name
+    }
+    return used | {
+        a.name
+        for n in ast.walk(tree)
+        if isinstance(n, ast.ImportFrom) and n.module == name
+        for a in n.names
+    }
 
 
 def test_posterior_asks_numba_for_threads_alone() -> None:
     """The one exception to numba's fence: how many threads there are and may be used."""
-    assert attributes(SOURCES["bayesfred.inference.posterior"], "numba") == {"config", "get_num_threads", "set_num_threads"}
+    assert attributes(SOURCES["bayesfred.model.posterior"], "numba") == {
+        "config",
+        "get_num_threads",
+        "set_num_threads",
+    }
     assert attributes("import numba\n@numba.njit\ndef f(x):\n    return x", "numba") == {"njit"}
     assert attributes("from numba import njit", "numba") == {"njit"}
 
 
-FORBIDDEN_MODULES = {"pickle", "_pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
+FORBIDDEN_MODULES = {
+    "pickle",
+    "_pickle",
+    "cPickle",
+    "cloudpickle",
+    "dill",
+    "joblib",
+    "marshal",
+    "shelve",
+}
 
 
 def unsafe(source: str) -> list[int]:
     """Lines that run what a file or a string holds: pickles, eval, exec, arrays of objects."""
-    lines = [i.line for i in imports(source, "bayesfred.x") if i.module.split(".")[0] in FORBIDDEN_MODULES]
+    lines = [
+        i.line
+        for i in imports(source, "bayesfred.x")
+        if i.module.split(".")[0] in FORBIDDEN_MODULES
+    ]
     for call in calls(source):
         if called(call) in ("eval", "exec", "compile", "builtins.eval", "builtins.exec"):
             lines.append(call.lineno)
@@ -313,7 +383,7 @@ def test_unsafe_is_seen(source: str) -> None:
     assert len(unsafe(source)) == 1
 
 
-# ------------------------------------------------------------------------------------------------------------- documentation
+# --------------------------------------------------------------------------------------------------
 
 SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
 
@@ -333,7 +403,13 @@ def described(section: str) -> list[str]:
 def arguments(function: ast.FunctionDef) -> list[str]:
     """Names of a function's parameters, self and cls left out."""
     a = function.args
-    every = [*a.posonlyargs, *a.args, *([a.vararg] if a.vararg else []), *a.kwonlyargs, *([a.kwarg] if a.kwarg else [])]
+    every = [
+        *a.posonlyargs,
+        *a.args,
+        *([a.vararg] if a.vararg else []),
+        *a.kwonlyargs,
+        *([a.kwarg] if a.kwarg else []),
+    ]
     return [argument.arg for argument in every if argument.arg not in ("self", "cls")]
 
 
@@ -351,8 +427,16 @@ def construction(node: ast.ClassDef) -> list[str]:
         return arguments(methods(node)["__init__"])
     if "dataclass" not in decorators(node):
         return []
-    fields = [child for child in node.body if isinstance(child, ast.AnnAssign) and isinstance(child.target, ast.Name)]
-    return [ast.unparse(child.target) for child in fields if "ClassVar" not in ast.unparse(child.annotation)]
+    fields = [
+        child
+        for child in node.body
+        if isinstance(child, ast.AnnAssign) and isinstance(child.target, ast.Name)
+    ]
+    return [
+        ast.unparse(child.target)
+        for child in fields
+        if "ClassVar" not in ast.unparse(child.annotation)
+    ]
 
 
 def raises(node: ast.AST) -> bool:
@@ -366,8 +450,17 @@ def definitions(source: str) -> dict[str, Definition]:
 
 def promised(source: str) -> set[str]:
     """Methods that a protocol of the module documents for every class that has them."""
-    protocols = [n for n in definitions(source).values() if isinstance(n, ast.ClassDef) and "Protocol" in map(ast.unparse, n.bases)]
-    return {name for node in protocols for name, method in methods(node).items() if ast.get_docstring(method)}
+    protocols = [
+        n
+        for n in definitions(source).values()
+        if isinstance(n, ast.ClassDef) and "Protocol" in map(ast.unparse, n.bases)
+    ]
+    return {
+        name
+        for node in protocols
+        for name, method in methods(node).items()
+        if ast.get_docstring(method)
+    }
 
 
 def undocumented(source: str, name: str) -> list[str]:
@@ -380,11 +473,19 @@ def undocumented(source: str, name: str) -> list[str]:
         missing += [f"field {field}" for field in construction(node) if field not in told]
         made = [m for n, m in methods(node).items() if n in ("__init__", "__post_init__")]
         missing += ["Raises"] if any(map(raises, made)) and "Raises" not in sections else []
-        public = [m for n, m in methods(node).items() if not n.startswith("_") and n not in promised(source)]
+        public = [
+            m
+            for n, m in methods(node).items()
+            if not n.startswith("_") and n not in promised(source)
+        ]
         return missing + [f"docstring of {m.name}" for m in public if not ast.get_docstring(m)]
     if arguments(node) and "Parameters" not in sections:
         missing.append("Parameters")
-    if node.returns is not None and ast.unparse(node.returns) != "None" and "Returns" not in sections:
+    if (
+        node.returns is not None
+        and ast.unparse(node.returns) != "None"
+        and "Returns" not in sections
+    ):
         missing.append("Returns")
     return missing + (["Raises"] if raises(node) and "Raises" not in sections else [])
 
@@ -406,7 +507,7 @@ def defined_in(name: str) -> str:
     return str(getattr(bayesfred, name).__module__)
 
 
-PUBLIC = [name for name in bayesfred.__all__ if name != "runs"]
+PUBLIC = [name for name in bayesfred.__all__ if name != "commands"]
 
 
 def test_public_names_exist() -> None:
@@ -418,7 +519,12 @@ def test_public_names_exist() -> None:
 def test_stub_names_what_it_imports() -> None:
     """The stub is what a type checker and `lazy_loader` read: its __all__ and its imports are one list."""
     tree = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
-    names = [alias.asname or alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    names = [
+        alias.asname or alias.name
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    ]
     stated = [ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)]
     assert stated == [sorted(names)]
     assert stated == [sorted(bayesfred.__all__)]
@@ -429,9 +535,11 @@ def test_public_names_are_documented(name: str) -> None:
     assert undocumented(SOURCES[defined_in(name)], name) == []
 
 
-@pytest.mark.parametrize("name", ["compare", "demo", "fit", "report", "simulate_frame", "study", "verify"])
+@pytest.mark.parametrize(
+    "name", ["compare", "demo", "fit", "report", "simulate_frame", "study", "verify"]
+)
 def test_runs_are_documented(name: str) -> None:
-    assert undocumented(SOURCES["bayesfred.runs"], name) == []
+    assert undocumented(SOURCES["bayesfred.commands"], name) == []
 
 
 @pytest.mark.parametrize("module", SOURCES)
@@ -493,7 +601,12 @@ def test_good_documentation_passes() -> None:
         ("C", "    y : int\n", "", "field y"),
         ("C", "    y: int\n", "    y: int\n    w: int\n", "field w"),
         ("C", '"""Do nothing."""', "pass", "docstring of g"),
-        ("C", "def g(self) -> None:", "def __init__(self):\n        raise ValueError\n    def g(self) -> None:", "Raises"),
+        (
+            "C",
+            "def g(self) -> None:",
+            "def __init__(self):\n        raise ValueError\n    def g(self) -> None:",
+            "Raises",
+        ),
     ],
 )
 def test_lack_of_documentation_is_seen(name: str, old: str, new: str, lacking: str) -> None:
@@ -501,7 +614,10 @@ def test_lack_of_documentation_is_seen(name: str, old: str, new: str, lacking: s
     assert lacking in undocumented(GOOD.replace(old, new), name)
 
 
-@pytest.mark.parametrize(("old", "new"), [("x, y : int", "x : int"), ("x, y : int", "y, x : int"), ("y: int = 0", "w: int = 0")])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("x, y : int", "x : int"), ("x, y : int", "y, x : int"), ("y: int = 0", "w: int = 0")],
+)
 def test_disagreement_is_seen(old: str, new: str) -> None:
     assert disagreements(GOOD.replace(old, new)) == ["f"]
 
@@ -521,23 +637,40 @@ def test_missing_heading_is_seen() -> None:
     assert not has_heading('import math\n"""Sums of things."""\n')
 
 
-# ---------------------------------------------------------------------------------------------------------------- weight, size
+# --------------------------------------------------------------------------------------------------
 
-HEAVY = ("arviz_base", "arviz_stats", "astropy", "emcee", "h5py", "matplotlib", "numba", "pydantic", "scipy")
+HEAVY = (
+    "arviz_base",
+    "arviz_stats",
+    "astropy",
+    "emcee",
+    "h5py",
+    "matplotlib",
+    "numba",
+    "pydantic",
+    "scipy",
+)
 
 
 def loaded(code: str) -> set[str]:
     """The heavy packages that a fresh interpreter has loaded after running some code."""
     report = f"\nimport sys\nprint('loaded', *(name for name in {HEAVY} if name in sys.modules))"
     env = {name: value for name, value in os.environ.items() if name != "EAGER_IMPORT"}
-    done = subprocess.run([sys.executable, "-c", code + report], env=env, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code + report], env=env, capture_output=True, text=True, check=True
+    )
     return set(done.stdout.splitlines()[-1].split()[1:])
 
 
 def test_heavy_packages_are_loaded_when_they_are_needed() -> None:
     assert loaded("import bayesfred") == set()
     assert loaded("import bayesfred\nbayesfred.InputError, dir(bayesfred)") == set()
-    assert loaded("from bayesfred.cli import app\ntry:\n    app(['--help'])\nexcept SystemExit:\n    pass") == set()
+    assert (
+        loaded(
+            "from bayesfred.cli import app\ntry:\n    app(['--help'])\nexcept SystemExit:\n    pass"
+        )
+        == set()
+    )
 
 
 def test_heavy_package_is_seen() -> None:
@@ -547,11 +680,12 @@ def test_heavy_package_is_seen() -> None:
 # Modules longer than this, and why they are not cut.
 LONGEST = 400
 LONG = {
-    "bayesfred.inference.posterior": "one class, whose methods share the frame as the loops read it",
+    "bayesfred.model.posterior": "one class, whose methods share the frame as the loops read it",
     "bayesfred.settings": "one record a section, most of it what the fields mean",
-    "bayesfred.files": "three formats of frames and two of catalogues, most of it what damaged files get wrong",
+    "bayesfred.io.files": "three formats of frames and two of catalogues, most of it what damaged "
+    "files get wrong",
     "bayesfred.reporting.plots": "nine independent figures with one style",
-    "bayesfred.runs": "one function a command, and what they share",
+    "bayesfred.commands": "one function a command, and what they share",
 }
 
 
@@ -570,7 +704,11 @@ def test_long_module_is_seen() -> None:
 
 MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|tmp|home|root|Users|mnt)\b|\.\./shared|\b[A-Z]:\\")
 TEXTS = [
-    *(path for folder in ("bayesfred", "examples", "chains") for path in sorted((ROOT / folder).rglob("*"))),
+    *(
+        path
+        for folder in ("bayesfred", "examples", "chains")
+        for path in sorted((ROOT / folder).rglob("*"))
+    ),
     *(path for path in sorted(ROOT.iterdir()) if path.suffix in (".md", ".toml")),
 ]
 
@@ -582,15 +720,29 @@ def machine_paths(text: str) -> list[str]:
 
 def test_no_paths_of_one_machine() -> None:
     """Kept runs, which git ignores, are no text of the project."""
-    texts = [path for path in TEXTS if path.suffix in (".py", ".pyi", ".toml", ".md") or path.name == "template.html"]
+    texts = [
+        path
+        for path in TEXTS
+        if path.suffix in (".py", ".pyi", ".toml", ".md") or path.name == "template.html"
+    ]
     assert ROOT / "README.md" in texts
-    assert {path.name: found for path in texts if (found := machine_paths(path.read_text(encoding="utf-8")))} == {}
+    assert {
+        path.name: found
+        for path in texts
+        if (found := machine_paths(path.read_text(encoding="utf-8")))
+    } == {}
 
 
-@pytest.mark.parametrize("text", ["in /work", "'/work/main'", "open('/tmp/x')", "(../shared/data)", "/home/me/x", r"C:\data"])
+@pytest.mark.parametrize(
+    "text",
+    ["in /work", "'/work/main'", "open('/tmp/x')", "(../shared/data)", "/home/me/x", r"C:\data"],
+)
 def test_machine_path_is_seen(text: str) -> None:
     assert len(machine_paths(text)) == 1
 
 
 def test_other_slashes_are_no_machine_paths() -> None:
-    assert machine_paths("e-/adu, https://example.org/home/x, tests/work, and/or, 1/tmp, </root>") == []
+    assert (
+        machine_paths("e-/adu, https://example.org/home/x, tests/work, and/or, 1/tmp, </root>")
+        == []
+    )

@@ -1,7 +1,8 @@
 """The command line: whole runs, exit codes, one line for bad input, interruption, where files are looked up.
 
-Most tests run the commands in this process. Problems are small: 60 x 75 pixels, 3 x 3 sources, 3 terms. Every refusal is asked
-for its exit code, its one line, what the line names, and that no file changed.
+Most tests run the commands in this process. Problems are small: 60 x 75 pixels, 3 x 3 sources, 3
+terms. Every refusal is asked for its exit code, its one line, what the line names, and that no file
+changed.
 """
 
 import contextlib
@@ -30,16 +31,17 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import bayesfred
-from bayesfred import assembly, files
+from bayesfred import build
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.cli import app
+from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference.chainfile import Chain, open_chain
-from bayesfred.inference.estimate import find_map
-from bayesfred.inference.examine import seal
-from bayesfred.inference.posterior import Posterior
+from bayesfred.io import files
+from bayesfred.io.hdf5_checks import seal
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.find_map import find_map
+from bayesfred.sampling.chainfile import Chain, open_chain
 from bayesfred.settings import RunSettings, read_settings
 
 ROOT = Path(__file__).parents[1]
@@ -89,7 +91,10 @@ def invoke(folder: Path, *args: str | Path, data: Path | None = None) -> Output:
 
 def command(*args: str) -> list[str]:
     """The command line as a process of its own, which a Ctrl-C reaches even where this one was started without."""
-    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from bayesfred.cli import app; app()"
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from "
+        "bayesfred.cli import app; app()"
+    )
     return [sys.executable, "-c", code, *args]
 
 
@@ -137,7 +142,7 @@ def folder(simulated: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(simulated, tmp_path / "here"))
 
 
-# ---------------------------------------------------------------------------------------------------------------- whole runs
+# --------------------------------------------------------------------------------------------------
 
 
 def test_simulated_frame_is_what_the_run_file_describes(simulated: Path) -> None:
@@ -157,9 +162,21 @@ def test_fit_leaves_a_chain_a_page_and_a_picture(finished: tuple[Path, Output]) 
     assert "Traceback" not in output.stderr
     visible = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
     assert visible == {"run.toml", "frame.fits", "stars.csv", "run.h5", "run.html", "run.png"}
-    for word in ("coefficient", "MAP", "posterior mean", "R-hat", "ESS", "none masked", "run.h5", "run.html", "run.png"):
+    for word in (
+        "coefficient",
+        "MAP",
+        "posterior mean",
+        "R-hat",
+        "ESS",
+        "none masked",
+        "run.h5",
+        "run.html",
+        "run.png",
+    ):
         assert word in output.stdout
-    rows = [line for line in output.stdout.splitlines() if any(f"{name} " in line for name in NAMES)]
+    rows = [
+        line for line in output.stdout.splitlines() if any(f"{name} " in line for name in NAMES)
+    ]
     assert [next(name for name in NAMES if f" {name} " in row) for row in rows] == list(NAMES)
     assert "\nconverged: " in output.stdout
 
@@ -183,7 +200,11 @@ class _Tags(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
-        self.references += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        self.references += [
+            value or ""
+            for name, value in attrs
+            if name in ("src", "href", "srcset", "data", "action")
+        ]
 
 
 def check_page_and_picture(folder: Path, stem: str) -> None:
@@ -213,14 +234,22 @@ def test_report_makes_page_and_picture_anew(finished: tuple[Path, Output], tmp_p
     assert all(name in output.stdout for name in NAMES)
     check_page_and_picture(tmp_path, "run")
     assert (tmp_path / "run.h5").read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.h5", "run.html", "run.png"]  # a reader takes no lock
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "run.h5",
+        "run.html",
+        "run.png",
+    ]  # a reader takes no lock
 
 
-def test_report_that_asks_for_more_than_there_is_exits_with_3(finished: tuple[Path, Output], tmp_path: Path) -> None:
+def test_report_that_asks_for_more_than_there_is_exits_with_3(
+    finished: tuple[Path, Output], tmp_path: Path
+) -> None:
     shutil.copy(finished[0] / "run.h5", tmp_path)
     output = invoke(tmp_path, "report", "run.h5", "--target-ess", "1000000")
     assert output.code == 3
-    assert re.search(r"^not converged: effective sample size \d+ of \w+ is below 1000000$", output.stdout, re.M)
+    assert re.search(
+        r"^not converged: effective sample size \d+ of \w+ is below 1000000$", output.stdout, re.M
+    )
 
 
 def test_verify_says_what_holds(finished: tuple[Path, Output], tmp_path: Path) -> None:
@@ -245,8 +274,12 @@ def test_verify_says_what_holds(finished: tuple[Path, Output], tmp_path: Path) -
     path.write_bytes(path.read_bytes() + seal(path.read_bytes()))
     output = invoke(tmp_path, "verify", "run.h5")
     assert output.code == 3
-    assert re.search(r"│ first steps +│ \d+ made again from seed 99: differ from step 1 on +│ no ", output.stdout)
-    assert re.search(r"│ log-probability +│ 1000 of \d+ draws: differ by at most 0 +│ yes ", output.stdout)
+    assert re.search(
+        r"│ first steps +│ \d+ made again from seed 99: differ from step 1 on +│ no ", output.stdout
+    )
+    assert re.search(
+        r"│ log-probability +│ 1000 of \d+ draws: differ by at most 0 +│ yes ", output.stdout
+    )
     assert f"made with numpy 1.0 (here {np.__version__})" in output.stdout
 
 
@@ -254,7 +287,9 @@ def test_too_few_steps_then_resume_then_overwrite(folder: Path) -> None:
     (folder / "run.toml").write_text(run_text(sampling=FEW_STEPS), encoding="utf-8")
     first = invoke(folder, "fit", "run.toml")
     assert first.code == 3
-    assert re.search(r"^not converged: .*effective sample size \d+ of \w+ is below 1000", first.stdout, re.M)
+    assert re.search(
+        r"^not converged: .*effective sample size \d+ of \w+ is below 1000", first.stdout, re.M
+    )
     chain = open_chain(folder / "run.h5")
     assert chain.chain.shape == (4, 12, 32, 4)
 
@@ -307,14 +342,22 @@ def test_what_the_prior_dominates_is_named(folder: Path) -> None:
 
 def test_demo(tmp_path: Path) -> None:
     """4: of 13 scores, normal if the error bars hold, one in 1,200 demos has a larger one; the seed is fixed."""
-    output = invoke(tmp_path, "demo", "--folder", "runs")
+    output = invoke(tmp_path, "demo", "--folder", "commands")
     assert output.code == 0
-    folder = tmp_path / "runs"
-    assert {path.name for path in folder.iterdir() if not path.name.startswith(".")} == {"demo.h5", "demo.html", "demo.png"}
+    folder = tmp_path / "commands"
+    assert {path.name for path in folder.iterdir() if not path.name.startswith(".")} == {
+        "demo.h5",
+        "demo.html",
+        "demo.png",
+    }
     check_page_and_picture(folder, "demo")
     chain = open_chain(folder / "demo.h5")
     simulation = tomllib.loads(EXAMPLE.read_text(encoding="utf-8"))["simulation"]
-    truth = {**dict.fromkeys(chain.parameter_names, 0.0), **simulation["theta"], "background": simulation["background"]}
+    truth = {
+        **dict.fromkeys(chain.parameter_names, 0.0),
+        **simulation["theta"],
+        "background": simulation["background"],
+    }
     z = z_scores(chain, truth)
     assert len(z) == 13
     assert max(map(abs, z.values())) < 4
@@ -323,12 +366,18 @@ def test_demo(tmp_path: Path) -> None:
     assert min(*verdict.ess_bulk.values(), *verdict.ess_tail.values()) >= 1000
     for name, score in z.items():  # the table shows the same
         row = next(line for line in output.stdout.splitlines() if f" {name} " in line)
-        assert any(abs(float(cell) - score) < 0.02 for cell in re.findall(r" ([+-]\d+\.\d\d) ", row))
+        assert any(
+            abs(float(cell) - score) < 0.02 for cell in re.findall(r" ([+-]\d+\.\d\d) ", row)
+        )
         assert float(row.split("│")[-2]) == pytest.approx(verdict.prior_sensitivity[name], abs=6e-4)
-    assert verdict.prior_dominated == () and "prior-dominated" not in output.stdout  # the default priors are weak
+    assert (
+        verdict.prior_dominated == () and "prior-dominated" not in output.stdout
+    )  # the default priors are weak
 
     before = snapshot(tmp_path)
-    assert_refused(invoke(tmp_path, "demo", "--folder", "runs"), "demo.h5", "exists", "--overwrite")
+    assert_refused(
+        invoke(tmp_path, "demo", "--folder", "commands"), "demo.h5", "exists", "--overwrite"
+    )
     assert snapshot(tmp_path) == before
 
 
@@ -348,11 +397,13 @@ def test_every_command_is_explained(tmp_path: Path) -> None:
 
 
 def test_console_script_is_the_app() -> None:
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "scripts"
+    ]
     assert scripts == {"bayesfred": "bayesfred.cli:app"}
 
 
-# ----------------------------------------------------------------------------------------------------------------- bad input
+# --------------------------------------------------------------------------------------------------
 
 Prepare = Callable[[Path], None]
 
@@ -392,7 +443,9 @@ def spoil_pixel(value: float) -> Prepare:
 
 def cut_frame(size: int) -> Prepare:
     """Keep the first bytes of the frame."""
-    return lambda folder: (folder / "frame.fits").write_bytes((folder / "frame.fits").read_bytes()[:size])
+    return lambda folder: (folder / "frame.fits").write_bytes(
+        (folder / "frame.fits").read_bytes()[:size]
+    )
 
 
 def claim(columns: int, rows: int) -> Prepare:
@@ -422,8 +475,15 @@ def both(*steps: Prepare) -> Prepare:
 
 def frame_without_image(folder: Path) -> None:
     """A FITS file of one header: 36 cards of 80 characters, and no data."""
-    cards = ("SIMPLE  =                    T", "BITPIX  =                    8", "NAXIS   =                    0", "END")
-    (folder / "frame.fits").write_bytes("".join(card.ljust(80) for card in cards).ljust(2880).encode())
+    cards = (
+        "SIMPLE  =                    T",
+        "BITPIX  =                    8",
+        "NAXIS   =                    0",
+        "END",
+    )
+    (folder / "frame.fits").write_bytes(
+        "".join(card.ljust(80) for card in cards).ljust(2880).encode()
+    )
 
 
 def frame_in_hdf5(folder: Path) -> None:
@@ -455,64 +515,186 @@ ON_AXIS = "f_terms = [[1, 0, 1, 0]]\ng_terms = [[0, 0, 2, 0]]"
 
 REFUSALS = [
     Refusal("missing run file", unchanged, ("absent.toml", "no such file"), ("fit", "absent.toml")),
-    Refusal("run file not TOML", content("run.toml", "frame: frame.fits"), ("run.toml", "not TOML")),
-    Refusal("unknown key", sections(frame='path = "frame.fits"\ngian = 2.0'), ("run.toml", "frame.gian", "'gain'")),
+    Refusal(
+        "run file not TOML", content("run.toml", "frame: frame.fits"), ("run.toml", "not TOML")
+    ),
+    Refusal(
+        "unknown key",
+        sections(frame='path = "frame.fits"\ngian = 2.0'),
+        ("run.toml", "frame.gian", "'gain'"),
+    ),
     Refusal("missing frame", without("frame.fits"), ("run.toml", "frame.fits", "BAYESFRED_DATA")),
     Refusal("not a FITS", content("frame.fits", "no FITS at all"), ("frame.fits", "FITS")),
     Refusal("truncated FITS", cut_frame(20_000), ("frame.fits", "FITS")),
     Refusal("truncated header", cut_frame(1000), ("frame.fits", "FITS")),
     Refusal("empty FITS", cut_frame(0), ("frame.fits", "FITS")),
-    Refusal("absurd NAXIS", claim(10**9, 10**9), ("frame.fits", "1000000000 x 1000000000 pixels", "GB of memory", "bin")),
-    Refusal("more than memory", claim(10**6, 10**5), ("frame.fits", "100000 x 1000000 pixels", "GB of memory", "bin")),
+    Refusal(
+        "absurd NAXIS",
+        claim(10**9, 10**9),
+        ("frame.fits", "1000000000 x 1000000000 pixels", "GB of memory", "bin"),
+    ),
+    Refusal(
+        "more than memory",
+        claim(10**6, 10**5),
+        ("frame.fits", "100000 x 1000000 pixels", "GB of memory", "bin"),
+    ),
     Refusal("negative NAXIS", claim(-75, 60), ("frame.fits",)),
     Refusal("no image", frame_without_image, ("frame.fits", "2-D image")),
     Refusal("negative counts", spoil_pixel(-3.0), ("frame.fits", "-3", "row 5, column 7", "gain")),
     Refusal("part of a count", spoil_pixel(1.5), ("frame.fits", "1.5", "row 5, column 7", "gain")),
-    Refusal("more than float64 counts", spoil_pixel(1e300), ("frame.fits", "1e+300", "row 5, column 7", "at most 9e+15")),
-    Refusal("nested TOML", content("run.toml", f"deep = {'[' * 20_000}{']' * 20_000}"), ("run.toml", "nested too deeply")),
-    Refusal("nan in TOML", sections(psf="sigma = nan"), ("run.toml", "psf.sigma", "nan", "finite")),
-    Refusal("inf in TOML", sections(model="tolerance = -inf"), ("run.toml", "model.tolerance", "inf", "finite")),
-    Refusal("text for a number", sections(psf='sigma = "2.5"'), ("run.toml", "psf.sigma", "'2.5'", "number")),
-    Refusal("number for a text", sections(frame="path = 7"), ("run.toml", "frame.path", "7", "string")),
-    Refusal("date for a text", sections(frame="path = 2000-01-01"), ("run.toml", "frame.path", "2000-01-01", "string")),
-    Refusal("array for a table", content("run.toml", "frame = [1]"), ("run.toml", "frame", "[1]", "table")),
-    Refusal("duplicate sources", content("stars.csv", "x,y,flux\n1,2,9\n3,4,9\n1,2,8\n"), ("stars.csv", "row 3", "in row 1")),
-    Refusal("negative flux", content("stars.csv", "x,y,flux\n1,2,-9\n"), ("stars.csv", "row 1", "'flux'", "-9", "positive")),
     Refusal(
-        "absurd flux", content("stars.csv", "x,y,flux\n1,2,1e200\n"), ("stars.csv", "row 1", "'flux'", "1e+200", "at most 9e+15")
+        "more than float64 counts",
+        spoil_pixel(1e300),
+        ("frame.fits", "1e+300", "row 5, column 7", "at most 9e+15"),
     ),
-    Refusal("nan position", content("stars.csv", "x,y,flux\nnan,2,9\n"), ("stars.csv", "row 1", "'x'", "nan", "finite")),
+    Refusal(
+        "nested TOML",
+        content("run.toml", f"deep = {'[' * 20_000}{']' * 20_000}"),
+        ("run.toml", "nested too deeply"),
+    ),
+    Refusal("nan in TOML", sections(psf="sigma = nan"), ("run.toml", "psf.sigma", "nan", "finite")),
+    Refusal(
+        "inf in TOML",
+        sections(model="tolerance = -inf"),
+        ("run.toml", "model.tolerance", "inf", "finite"),
+    ),
+    Refusal(
+        "text for a number",
+        sections(psf='sigma = "2.5"'),
+        ("run.toml", "psf.sigma", "'2.5'", "number"),
+    ),
+    Refusal(
+        "number for a text", sections(frame="path = 7"), ("run.toml", "frame.path", "7", "string")
+    ),
+    Refusal(
+        "date for a text",
+        sections(frame="path = 2000-01-01"),
+        ("run.toml", "frame.path", "2000-01-01", "string"),
+    ),
+    Refusal(
+        "array for a table",
+        content("run.toml", "frame = [1]"),
+        ("run.toml", "frame", "[1]", "table"),
+    ),
+    Refusal(
+        "duplicate sources",
+        content("stars.csv", "x,y,flux\n1,2,9\n3,4,9\n1,2,8\n"),
+        ("stars.csv", "row 3", "in row 1"),
+    ),
+    Refusal(
+        "negative flux",
+        content("stars.csv", "x,y,flux\n1,2,-9\n"),
+        ("stars.csv", "row 1", "'flux'", "-9", "positive"),
+    ),
+    Refusal(
+        "absurd flux",
+        content("stars.csv", "x,y,flux\n1,2,1e200\n"),
+        ("stars.csv", "row 1", "'flux'", "1e+200", "at most 9e+15"),
+    ),
+    Refusal(
+        "nan position",
+        content("stars.csv", "x,y,flux\nnan,2,9\n"),
+        ("stars.csv", "row 1", "'x'", "nan", "finite"),
+    ),
     Refusal("missing catalogue", without("stars.csv"), ("run.toml", "stars.csv", "BAYESFRED_DATA")),
-    Refusal("missing column", content("stars.csv", "x,y,light\n0,0,1\n"), ("stars.csv", "'flux'", "'light'")),
+    Refusal(
+        "missing column",
+        content("stars.csv", "x,y,light\n0,0,1\n"),
+        ("stars.csv", "'flux'", "'light'"),
+    ),
     Refusal("empty catalogue", content("stars.csv", "x,y,flux\n"), ("stars.csv", "empty")),
     Refusal("catalogue of no bytes", content("stars.csv", ""), ("stars.csv", "empty")),
-    Refusal("output exists", content("run.h5", "precious"), ("run.h5", "exists", "--resume", "--overwrite")),
+    Refusal(
+        "output exists",
+        content("run.h5", "precious"),
+        ("run.h5", "exists", "--resume", "--overwrite"),
+    ),
     Refusal("page exists", content("run.html", "precious"), ("run.html", "exists", "--overwrite")),
     Refusal("picture exists", content("run.png", "precious"), ("run.png", "exists", "--overwrite")),
-    Refusal("output is a folder", lambda folder: (folder / "run.h5").mkdir(), ("run.h5", "folder", "remove"), OVERWRITE),
-    Refusal("output is the frame", both(frame_in_hdf5, sections(frame=IN_HDF5)), ("run.toml", "output.path", "frame"), OVERWRITE),
+    Refusal(
+        "output is a folder",
+        lambda folder: (folder / "run.h5").mkdir(),
+        ("run.h5", "folder", "remove"),
+        OVERWRITE,
+    ),
+    Refusal(
+        "output is the frame",
+        both(frame_in_hdf5, sections(frame=IN_HDF5)),
+        ("run.toml", "output.path", "frame"),
+        OVERWRITE,
+    ),
     Refusal("name too long", sections(output=f'path = "{"a" * 990}.h5"'), (".h5", "too long")),
-    Refusal("name too long for its companions", sections(output=f'path = "{"a" * 250}.h5"'), (".h5", "too long")),
-    Refusal("missing output folder", sections(output='path = "absent/run.h5"'), ("run.h5", "no folder absent")),
-    Refusal("simulated frame too large", sections(simulation=TOO_LARGE), ("run.toml", "simulation.shape", "GB"), SIMULATE),
-    Refusal("folded map", sections(**{"simulation.theta": "f_ux = -0.2"}), ("run.toml", "simulation.theta", "folds"), SIMULATE),
-    Refusal("no simulation", content("run.toml", run_text().split("[simulation]")[0]), ("run.toml", "simulation"), SIMULATE),
-    Refusal("unknown true term", sections(**{"simulation.theta": "f_zz = 1"}), ("run.toml", "simulation.theta", "f_zz"), SIMULATE),
-    Refusal("simulated files exist", unchanged, ("exists", "--overwrite"), ("simulate", "run.toml")),
+    Refusal(
+        "name too long for its companions",
+        sections(output=f'path = "{"a" * 250}.h5"'),
+        (".h5", "too long"),
+    ),
+    Refusal(
+        "missing output folder",
+        sections(output='path = "absent/run.h5"'),
+        ("run.h5", "no folder absent"),
+    ),
+    Refusal(
+        "simulated frame too large",
+        sections(simulation=TOO_LARGE),
+        ("run.toml", "simulation.shape", "GB"),
+        SIMULATE,
+    ),
+    Refusal(
+        "folded map",
+        sections(**{"simulation.theta": "f_ux = -0.2"}),
+        ("run.toml", "simulation.theta", "folds"),
+        SIMULATE,
+    ),
+    Refusal(
+        "no simulation",
+        content("run.toml", run_text().split("[simulation]")[0]),
+        ("run.toml", "simulation"),
+        SIMULATE,
+    ),
+    Refusal(
+        "unknown true term",
+        sections(**{"simulation.theta": "f_zz = 1"}),
+        ("run.toml", "simulation.theta", "f_zz"),
+        SIMULATE,
+    ),
+    Refusal(
+        "simulated files exist", unchanged, ("exists", "--overwrite"), ("simulate", "run.toml")
+    ),
     Refusal("missing chain", unchanged, ("absent.h5", "no such file"), ("report", "absent.h5")),
     Refusal("no chain", unchanged, ("frame.fits", "seal"), ("report", "frame.fits")),
 ]
 
 # What is wrong here is found by the objects that the run file describes, which name the field.
 DESCRIBED = [
-    Refusal("sources outside", content("stars.csv", "x,y,flux\n900,0,5e3\n0,800,5e3\n"), ("catalogue", "2 sources", "outside")),
+    Refusal(
+        "sources outside",
+        content("stars.csv", "x,y,flux\n900,0,5e3\n0,800,5e3\n"),
+        ("catalogue", "2 sources", "outside"),
+    ),
     Refusal("term on the axis", sections(distortion=ON_AXIS), ("g_terms", "g_u2", "i + j >= 1")),
     Refusal("narrow PSF", sections(psf="sigma = 0.3"), ("psf", "sigma", "0.3", "impulse", "box")),
-    Refusal("prior of nothing", sections(**{"prior.f_zz": 'distribution = "norm"'}), ("prior", "f_zz", "g_vy")),
+    Refusal(
+        "prior of nothing",
+        sections(**{"prior.f_zz": 'distribution = "norm"'}),
+        ("prior", "f_zz", "g_vy"),
+    ),
     Refusal("folds alone", sections(**{"prior.f_ux": FOLDED}), ("run.toml", "no density", "fold")),
-    Refusal("pixels wider than the PSF", sections(psf="sigma = 1e-4", detector='pixel = "box"'), ("psf", "sigma", "1e+04", "box")),
-    Refusal("unknown distribution", sections(**{"prior.f_ux": 'distribution = "nrm"'}), ("prior.f_ux", "distribution", "'nrm'")),
-    Refusal("prior's keyword", sections(**{"prior.f_ux": 'distribution = "norm"\nsd = 1'}), ("prior.f_ux", "norm", "sd")),
+    Refusal(
+        "pixels wider than the PSF",
+        sections(psf="sigma = 1e-4", detector='pixel = "box"'),
+        ("psf", "sigma", "1e+04", "box"),
+    ),
+    Refusal(
+        "unknown distribution",
+        sections(**{"prior.f_ux": 'distribution = "nrm"'}),
+        ("prior.f_ux", "distribution", "'nrm'"),
+    ),
+    Refusal(
+        "prior's keyword",
+        sections(**{"prior.f_ux": 'distribution = "norm"\nsd = 1'}),
+        ("prior.f_ux", "norm", "sd"),
+    ),
 ]
 
 
@@ -561,9 +743,13 @@ def test_bad_value_names_the_run_file(refusal: Refusal, folder: Path) -> None:
 def test_more_parameters_than_the_frame_determines(folder: Path) -> None:
     """One source cannot tell terms apart that differ in the power of its own position alone."""
     sections(distortion=MIRRORED)(folder)
-    output = check_refusal(Refusal("", content("stars.csv", "x,y,flux\n8,8,5000\n"), ("cannot determine",)), folder)
+    output = check_refusal(
+        Refusal("", content("stars.csv", "x,y,flux\n8,8,5000\n"), ("cannot determine",)), folder
+    )
     named = set(re.findall(r"\b[fg]_[uvxy2]+\b", output.stderr))
-    mirrored = {f"{letter}_{term}{axis}" for letter, axis in ("fx", "gy") for term in ("u", "v", "u2", "v2")}
+    mirrored = {
+        f"{letter}_{term}{axis}" for letter, axis in ("fx", "gy") for term in ("u", "v", "u2", "v2")
+    }
     mirrored |= {f"{letter}_{term}{axis}2" for letter, axis in ("fx", "gy") for term in ("u", "v")}
     assert named
     assert named < mirrored
@@ -593,10 +779,14 @@ def change_schema(path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [cut, change_schema, flip_a_byte, drop_an_ensemble])
-def test_damaged_chain(change: Callable[[Path], None], finished: tuple[Path, Output], tmp_path: Path) -> None:
+def test_damaged_chain(
+    change: Callable[[Path], None], finished: tuple[Path, Output], tmp_path: Path
+) -> None:
     shutil.copy(finished[0] / "run.h5", tmp_path)
     change(tmp_path / "run.h5")
-    assert names_a_file(check_refusal(Refusal("", unchanged, ("run.h5",), ("report", "run.h5")), tmp_path))
+    assert names_a_file(
+        check_refusal(Refusal("", unchanged, ("run.h5",), ("report", "run.h5")), tmp_path)
+    )
 
 
 @pytest.mark.parametrize("scale", ["0.0", "-1.0"])
@@ -612,11 +802,16 @@ def test_output_that_the_report_would_replace(suffix: str, folder: Path) -> None
 
 
 def test_simulate_writes_both_files_or_none(folder: Path) -> None:
-    check_refusal(Refusal("", without("stars.csv"), ("frame.fits", "exists"), ("simulate", "run.toml")), folder)
+    check_refusal(
+        Refusal("", without("stars.csv"), ("frame.fits", "exists"), ("simulate", "run.toml")),
+        folder,
+    )
 
 
 def test_demo_folder_is_a_file(folder: Path) -> None:
-    check_refusal(Refusal("", unchanged, ("run.toml", "folder"), ("demo", "--folder", "run.toml")), folder)
+    check_refusal(
+        Refusal("", unchanged, ("run.toml", "folder"), ("demo", "--folder", "run.toml")), folder
+    )
 
 
 def test_wrong_option(folder: Path) -> None:
@@ -630,13 +825,19 @@ def test_wrong_option(folder: Path) -> None:
 def test_refusal_from_a_shell(folder: Path) -> None:
     """A process of its own: exit code, nothing on standard output, one line, no traceback."""
     done = subprocess.run(
-        command("fit", "absent.toml"), cwd=folder, env=environment(), capture_output=True, text=True, check=False, timeout=120
+        command("fit", "absent.toml"),
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
     )
     assert_refused(Output(done.returncode, done.stdout, done.stderr), "absent.toml")
     assert done.stdout == ""
 
 
-# ------------------------------------------------------------------------------------------- what is odd, and accepted or counted
+# ------------------------------------------------------------------------------------------- what i
 
 
 def page_text(path: Path) -> str:
@@ -671,7 +872,9 @@ def test_what_frame_and_catalogue_do_not_share_is_clipped_if_asked_for(folder: P
     lines = (folder / "stars.csv").read_text().splitlines()
     (folder / "stars.csv").write_text("\n".join([*lines[:3], *lines[4:], "24,8,5000", ""]))
     output = invoke(folder, "fit", "run.toml")
-    assert "exceed the noise" in output.stdout and "(sigma_clip leaves them out)" in output.stdout
+    assert (
+        "exceed the noise" in output.stdout and "(reject_outliers leaves them out)" in output.stdout
+    )
     sections(frame='path = "frame.fits"\nsigma_clip = true')(folder)
     output = invoke(folder, "fit", "run.toml", "--overwrite")
     assert output.code == 0
@@ -708,7 +911,7 @@ def test_sources_at_the_edge_are_kept_and_those_outside_left_out(folder: Path) -
 def test_what_is_left_out_as_outside_changes_no_pixel(simulated: Path) -> None:
     """A source just beyond, whose image a distortion of three prior standard deviations brings nearer, gives no light."""
     run = read_settings(simulated / "run.toml")
-    model = open_model(run, x=37.5 * (1 + assembly.STRAY) + 2.5 * (-2 * np.log(1e-8)) ** 0.5)
+    model = open_model(run, x=37.5 * (1 + build.STRAY) + 2.5 * (-2 * np.log(1e-8)) ** 0.5)
     prior = 0.1 / 37.5  # of f_ux: a tenth of the half-width at the corner
     theta = np.array([3 * prior, 0.0, 0.0]) * 37.5 / model.sources.x[0]
     assert model.expected_counts(theta).max() < 1e-7 * 5e3
@@ -717,7 +920,7 @@ def test_what_is_left_out_as_outside_changes_no_pixel(simulated: Path) -> None:
 
 def open_model(run: RunSettings, x: float) -> ForwardModel:
     sources = SourceCatalog(np.array([x]), np.array([0.0]), np.array([5e3]))
-    return assembly.forward_model(run, (60, 75), sources, GaussianPSF(2.5))
+    return build.forward_model(run, (60, 75), sources, GaussianPSF(2.5))
 
 
 def test_zero_background(folder: Path) -> None:
@@ -736,11 +939,13 @@ def test_counts_where_none_are_expected_are_impossible(finished: tuple[Path, Out
     params = np.array([*TRUTH.values(), 0.0])
     assert posterior.expected_counts(params).min() == 0
     assert posterior.log_prob(params) == -np.inf
-    np.testing.assert_array_equal(posterior.log_prob(np.stack([params, params])), [-np.inf, -np.inf])
+    np.testing.assert_array_equal(
+        posterior.log_prob(np.stack([params, params])), [-np.inf, -np.inf]
+    )
     assert np.isfinite(posterior.log_prob([*TRUTH.values(), 1e-3]))
 
 
-# -------------------------------------------------------------------------------------------- what a run file must not do or show
+# -------------------------------------------------------------------------------------------- what
 
 
 def escape(kind: str) -> Prepare:
@@ -764,7 +969,9 @@ def escape(kind: str) -> Prepare:
     return prepare
 
 
-@pytest.mark.parametrize("kind", ["absolute", "parent", "parent below", "link", "circle", "zero byte"])
+@pytest.mark.parametrize(
+    "kind", ["absolute", "parent", "parent below", "link", "circle", "zero byte"]
+)
 def test_no_chain_outside_the_folder_of_the_run(kind: str, folder: Path) -> None:
     check_refusal(Refusal("", escape(kind), ("run.toml", "output.path"), OVERWRITE), folder)
     assert snapshot(folder.parent / "outside") == {}
@@ -773,7 +980,9 @@ def test_no_chain_outside_the_folder_of_the_run(kind: str, folder: Path) -> None
 def test_no_chain_through_a_linked_default_folder(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     (folder / "chains").symlink_to(tmp_path / "outside")
-    (folder / "run.toml").write_text(run_text(sampling=FEW_STEPS).replace('[output]\npath = "run.h5"', "[output]"))
+    (folder / "run.toml").write_text(
+        run_text(sampling=FEW_STEPS).replace('[output]\npath = "run.h5"', "[output]")
+    )
     check_refusal(Refusal("", unchanged, ("run.toml", "output.path", "leads out of")), folder)
 
 
@@ -783,7 +992,9 @@ def test_no_chain_through_a_linked_default_folder(folder: Path, tmp_path: Path) 
 def test_links_are_not_written_through(name: str, target: str, option: str, folder: Path) -> None:
     (folder / "precious").write_text("precious")
     args = ("fit", "run.toml", *([option] if option else []))
-    assert names_a_link(check_refusal(Refusal("", link(name, target), (name, "link", "remove"), args), folder))
+    assert names_a_link(
+        check_refusal(Refusal("", link(name, target), (name, "link", "remove"), args), folder)
+    )
 
 
 def names_a_link(output: Output) -> bool:
@@ -791,7 +1002,9 @@ def names_a_link(output: Output) -> bool:
 
 
 @pytest.mark.parametrize("name", ["run.html", "run.png"])
-def test_report_replaces_links_and_leaves_their_targets(name: str, finished: tuple[Path, Output], tmp_path: Path) -> None:
+def test_report_replaces_links_and_leaves_their_targets(
+    name: str, finished: tuple[Path, Output], tmp_path: Path
+) -> None:
     shutil.copy(finished[0] / "run.h5", tmp_path)
     (tmp_path / "precious").write_text("precious")
     (tmp_path / name).symlink_to("precious")
@@ -807,11 +1020,18 @@ def test_report_does_not_replace_its_chain(finished: tuple[Path, Output], tmp_pa
 
 @pytest.mark.parametrize("section", ["frame", "catalogue"])
 @pytest.mark.parametrize("place", ["../outside/new{}", "{root}/outside/new{}", "link/new{}"])
-def test_simulate_writes_beside_the_run_file_only(section: str, place: str, folder: Path, tmp_path: Path) -> None:
+def test_simulate_writes_beside_the_run_file_only(
+    section: str, place: str, folder: Path, tmp_path: Path
+) -> None:
     (tmp_path / "outside").mkdir()
     (folder / "link").symlink_to(tmp_path / "outside")
     path = place.format({"frame": ".fits", "catalogue": ".csv"}[section], root=tmp_path)
-    check_refusal(Refusal("", sections(**{section: f'path = "{path}"'}), ("run.toml", f"{section}.path"), SIMULATE), folder)
+    check_refusal(
+        Refusal(
+            "", sections(**{section: f'path = "{path}"'}), ("run.toml", f"{section}.path"), SIMULATE
+        ),
+        folder,
+    )
     assert snapshot(tmp_path / "outside") == {}
 
 
@@ -821,11 +1041,15 @@ EVIL = """<img src=x onerror="alert(1)">'&amp;{{ 7 * 7 }}"""
 def test_names_are_escaped_on_the_page(folder: Path) -> None:
     """The run file's name is the title, the frame's and the catalogue's are in the notes, columns in the settings."""
     (folder / "frame.fits").rename(folder / f"{EVIL}.fits")
-    (folder / "stars.csv").write_text((folder / "stars.csv").read_text().replace("flux", "<script>"))
+    (folder / "stars.csv").write_text(
+        (folder / "stars.csv").read_text().replace("flux", "<script>")
+    )
     (folder / "stars.csv").rename(folder / f"{EVIL}.csv")
     toml = json.dumps(EVIL)[:-1]
     catalogue = f'path = {toml}.csv"\nflux = "<script>"'
-    (folder / f"{EVIL}.toml").write_text(run_text(frame=f'path = {toml}.fits"', catalogue=catalogue, sampling=FEW_STEPS))
+    (folder / f"{EVIL}.toml").write_text(
+        run_text(frame=f'path = {toml}.fits"', catalogue=catalogue, sampling=FEW_STEPS)
+    )
     assert invoke(folder, "fit", f"{EVIL}.toml").code == 3
     page = (folder / "run.html").read_text(encoding="utf-8")
     found = _Tags(page)
@@ -852,17 +1076,23 @@ def test_control_characters_and_markup_are_spelt_out(folder: Path) -> None:
     assert output.code == 3
     assert all(c.isprintable() for line in output.stdout.splitlines() for c in line)
     assert f"chains/{spelt}.h5" in output.stdout
-    assert f"<title>{spelt}</title>" in (folder / "chains" / f"{CONTROL}.html").read_text(encoding="utf-8")
+    assert f"<title>{spelt}</title>" in (folder / "chains" / f"{CONTROL}.html").read_text(
+        encoding="utf-8"
+    )
 
     image = fits.ImageHDU(np.zeros((2, 2, 2)), name="<script>[red]")
     fits.HDUList([fits.PrimaryHDU(), image]).writeto(folder / "frame.fits", overwrite=True)
-    assert "<SCRIPT>[RED] 2 x 2 x 2" in invoke(folder, "fit", f"{CONTROL}.toml", "--overwrite").stderr
+    assert (
+        "<SCRIPT>[RED] 2 x 2 x 2" in invoke(folder, "fit", f"{CONTROL}.toml", "--overwrite").stderr
+    )
 
 
-# -------------------------------------------------------------------------------------------------------------- interruption
+# --------------------------------------------------------------------------------------------------
 
 
-def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes], seconds: float) -> None:
+def wait_for(
+    condition: Callable[[], object], process: subprocess.Popen[bytes], seconds: float
+) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, "the run ended by itself"
@@ -873,11 +1103,18 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes], 
 def stop_a_run(folder: Path, number: signal.Signals) -> tuple[int, list[str]]:
     """Begin a run of very many steps and send it a signal once it has made some: exit code, lines on standard error."""
     sections(sampling="steps = 100000")(folder)
-    # the progress bar counts steps on standard error, also in a file if it takes that for a terminal
+    # the progress bar counts steps on standard error, also in a file if it takes that for a
+    # terminal
     env = environment(FORCE_COLOR="1", TERM="xterm", COLUMNS="120")
     log = folder / "stderr.txt"
     with log.open("wb") as stderr:
-        process = subprocess.Popen(command("fit", "run.toml"), cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=stderr)
+        process = subprocess.Popen(
+            command("fit", "run.toml"),
+            cwd=folder,
+            env=env,
+            stdout=subprocess.DEVNULL,
+            stderr=stderr,
+        )
     try:
         wait_for(lambda: re.search(rb"\b[1-9]\d* steps", log.read_bytes()), process, 180)
         process.send_signal(number)
@@ -889,7 +1126,9 @@ def stop_a_run(folder: Path, number: signal.Signals) -> tuple[int, list[str]]:
 
 
 @pytest.fixture(scope="module")
-def interrupted(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, list[str]]:
+def interrupted(
+    simulated: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, int, list[str]]:
     """A run that got a Ctrl-C: folder, exit code, lines on standard error."""
     folder = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("interrupted") / "here"))
     return folder, *stop_a_run(folder, signal.SIGINT)
@@ -937,11 +1176,16 @@ def test_termination_saves_the_steps(simulated: Path, tmp_path: Path) -> None:
     assert lines[-1].startswith("bayesfred: interrupted; ")
     steps = open_chain(folder / "run.h5").chain.shape[1]
     sections(sampling=f"steps = {steps + 1}")(folder)
-    assert invoke(folder, "fit", "run.toml", "--resume").code in (0, 3)  # as so many steps suffice, or do not
+    assert invoke(folder, "fit", "run.toml", "--resume").code in (
+        0,
+        3,
+    )  # as so many steps suffice, or do not
     assert open_chain(folder / "run.h5").chain.shape[1] == steps + 1
 
 
-def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_in_a_likelihood_says_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ensembles take turns, a call a step; the 18th call, the first four being the walkers' places, is in the fourth step."""
     log_prob = Posterior.unchecked_log_prob
     calls = 0
@@ -961,14 +1205,19 @@ def test_ctrl_c_in_a_likelihood_says_one_line(folder: Path, monkeypatch: pytest.
     assert "Traceback" not in output.stdout
 
 
-def test_log_probabilities_that_are_no_numbers_are_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_probabilities_that_are_no_numbers_are_counted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log_prob = Posterior.unchecked_log_prob
     calls = 0
 
     def spoilt(posterior: Posterior, params: NDArray[np.float64]) -> NDArray[np.float64]:
         nonlocal calls
         values = log_prob(posterior, params)
-        calls += len(params) in (16, 32)  # an ensemble, or half of it in a step of differential evolution
+        calls += len(params) in (
+            16,
+            32,
+        )  # an ensemble, or half of it in a step of differential evolution
         if len(params) in (16, 32) and calls > 4:  # which place the walkers
             values[:2] = np.nan, np.inf
         return values
@@ -978,14 +1227,17 @@ def test_log_probabilities_that_are_no_numbers_are_counted(folder: Path, monkeyp
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 3
     assert calls >= 4 + 12 * 4
-    assert f"\n{2 * (calls - 4)} log-probabilities were NaN or infinite and taken as -inf" in output.stdout
+    assert (
+        f"\n{2 * (calls - 4)} log-probabilities were NaN or infinite and taken as -inf"
+        in output.stdout
+    )
 
 
 def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bayesfred.inference.sampling.find_map", stop)
+    monkeypatch.setattr("bayesfred.sampling.sampler.find_map", stop)
     before = snapshot(folder)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 130
@@ -994,7 +1246,7 @@ def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     assert snapshot(folder) == before
 
 
-# -------------------------------------------------------------------------------------------------------------------- places
+# --------------------------------------------------------------------------------------------------
 
 
 def with_bad_pixels(source: Path, target: Path, n: int) -> None:
@@ -1005,7 +1257,9 @@ def with_bad_pixels(source: Path, target: Path, n: int) -> None:
     files.write_frame(target, counts, overwrite=True)
 
 
-def test_paths_are_beside_the_run_file_then_in_the_data_folder(folder: Path, tmp_path: Path) -> None:
+def test_paths_are_beside_the_run_file_then_in_the_data_folder(
+    folder: Path, tmp_path: Path
+) -> None:
     """An unknown prior ends the runs once the files are read."""
     data, away = tmp_path / "data", tmp_path / "away"
     away.mkdir()
@@ -1025,7 +1279,9 @@ def test_paths_are_beside_the_run_file_then_in_the_data_folder(folder: Path, tmp
     assert_refused(invoke(away, "fit", run_file), str(folder / "frame.fits"))
 
 
-def test_default_output_is_in_chains_here_and_named_after_the_run_file(folder: Path, tmp_path: Path) -> None:
+def test_default_output_is_in_chains_here_and_named_after_the_run_file(
+    folder: Path, tmp_path: Path
+) -> None:
     away = tmp_path / "away"
     away.mkdir()
     text = run_text(sampling=FEW_STEPS).replace('[output]\npath = "run.h5"', "[output]")
@@ -1047,7 +1303,8 @@ def test_simulate_leaves_the_data_folder_alone(simulated: Path, tmp_path: Path) 
 
 
 @pytest.mark.skipif(
-    not (DATA / "startracker_alt60_azi45.fits").is_file(), reason="no real frames: BAYESFRED_DATA does not name their folder"
+    not (DATA / "startracker_alt60_azi45.fits").is_file(),
+    reason="no real frames: BAYESFRED_DATA does not name their folder",
 )
 def test_real_frame(tmp_path: Path) -> None:
     """A star tracker's frame with the example's run file as it stands."""
@@ -1058,7 +1315,8 @@ def test_real_frame(tmp_path: Path) -> None:
     chain = open_chain(tmp_path / "chains" / "startracker.h5")
     posterior = chain.posterior()
     slopes = dipoles(posterior, chain.estimate.params)
-    # the root mean square of so many standard normal numbers has a Monte Carlo error of 1 / sqrt(2 n)
+    # the root mean square of so many standard normal numbers has a Monte Carlo error of 1 / sqrt(2
+    # n)
     assert slopes.size > 100 and np.sqrt(np.mean(slopes**2)) < 1 + 4 / np.sqrt(2 * slopes.size)
     # negative control: without it, every other star stands beside its place
     fixed = replace(posterior.nuisances, position_scatter=False)

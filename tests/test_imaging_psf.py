@@ -11,24 +11,31 @@ import oracles
 import pytest
 from numpy.typing import NDArray
 from scipy import integrate, interpolate, ndimage
-from test_imaging import EXACT, assert_jacobian_is_right, fine_determinant, random_sources, random_theta, star
-from test_inference import LIMIT
-from test_inference_chain import reseal, run
-from test_inference_derivatives import STEP, errors, five_point
-from test_inference_map import excess
+from test_imaging import (
+    EXACT,
+    assert_jacobian_is_right,
+    fine_determinant,
+    random_sources,
+    random_theta,
+    star,
+)
+from test_model import LIMIT
+from test_model_derivatives import STEP, errors, five_point
+from test_optimize_map import excess
+from test_sampling_chain import reseal, run
 
-from bayesfred import assembly, settings
+from bayesfred import build, settings
 from bayesfred.errors import InputError
+from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector, correct_sampling
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import FWHM, PSF, GaussianPSF, MoffatPSF, SampledPSF
-from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference.chainfile import open_chain
-from bayesfred.inference.estimate import find_map
-from bayesfred.inference.noise import simulate
-from bayesfred.inference.posterior import Nuisances, Posterior
+from bayesfred.model.noise import simulate
+from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize.find_map import find_map
+from bayesfred.sampling.chainfile import open_chain
 
 Floats = NDArray[np.float64]
 
@@ -41,19 +48,28 @@ def lopsided(sigma: float, oversampling: int = 4, half: float = 6.0) -> Floats:
     n = round(half * sigma * oversampling)
     a = np.arange(-n, n + 1) / (oversampling * sigma)
     b = a[:, None]
-    return np.asarray(np.exp(-0.5 * (a**2 + 0.6 * a * b + 1.4 * b**2)) * (1.0 + 0.3 * np.tanh(a) + 0.2 * np.sin(b)))
+    return np.asarray(
+        np.exp(-0.5 * (a**2 + 0.6 * a * b + 1.4 * b**2))
+        * (1.0 + 0.3 * np.tanh(a) + 0.2 * np.sin(b))
+    )
 
 
 def spline(psf: SampledPSF, a: Floats, b: Floats) -> Floats:
     """The cubic spline through the samples, zero two samples beyond them, by scipy; scaled to unit volume."""
     n = len(psf.values)
     samples = np.arange(n) - (n - 1) / 2
-    knots = np.arange(n + 10) - (n + 9) / 2  # three coefficients, which stay zero, more to either side: it ends beyond the support
+    knots = (
+        np.arange(n + 10) - (n + 9) / 2
+    )  # three coefficients, which stay zero, more to either side: it ends beyond the support
     full = interpolate.BSpline.design_matrix(samples, knots, 3).toarray()
     c = np.zeros((n + 6, n + 6))
     c[3:-3, 3:-3] = np.linalg.solve(full[:, 3:-3], np.linalg.solve(full[:, 3:-3], psf.values).T).T
-    inside = np.clip(np.stack(np.broadcast_arrays(b, a), axis=-1) * psf.oversampling, -(n + 3) / 2, (n + 3) / 2)
-    return np.asarray(interpolate.NdBSpline((knots, knots), c, 3)(inside) / c.sum() * psf.oversampling**2)
+    inside = np.clip(
+        np.stack(np.broadcast_arrays(b, a), axis=-1) * psf.oversampling, -(n + 3) / 2, (n + 3) / 2
+    )
+    return np.asarray(
+        interpolate.NdBSpline((knots, knots), c, 3)(inside) / c.sum() * psf.oversampling**2
+    )
 
 
 def moffat(psf: MoffatPSF, a: Floats, b: Floats) -> Floats:
@@ -84,7 +100,8 @@ def dense(model: ForwardModel, theta: Floats, nodes: tuple[Floats, Floats]) -> F
 
 def impulse(model: ForwardModel, theta: Floats) -> Floats:
     return oracles.bin_fine(
-        dense(model, theta, oracles.impulse_nodes(model.detector.shape, model.detector.binning)), model.detector.binning
+        dense(model, theta, oracles.impulse_nodes(model.detector.shape, model.detector.binning)),
+        model.detector.binning,
     )
 
 
@@ -104,9 +121,13 @@ def test_counts_equal_the_dense_image(psf: PSF) -> None:
     rng = np.random.default_rng(80)
     for _ in range(5):
         theta = random_theta(rng, MIRRORED, SHAPE, 2.0)
-        model = ForwardModel(Detector(SHAPE), random_sources(rng, SHAPE, 6), psf, MIRRORED, tolerance=0.0)
+        model = ForwardModel(
+            Detector(SHAPE), random_sources(rng, SHAPE, 6), psf, MIRRORED, tolerance=0.0
+        )
         expected = impulse(model, theta)
-        assert model.expected_counts(theta, 2.5) == pytest.approx(expected + 2.5, rel=0, abs=EXACT * expected.max())
+        assert model.expected_counts(theta, 2.5) == pytest.approx(
+            expected + 2.5, rel=0, abs=EXACT * expected.max()
+        )
 
 
 def test_density_equals_the_formula(psf: PSF) -> None:
@@ -123,49 +144,74 @@ def test_sampled_psf_interpolates_its_samples() -> None:
     # of samples that vanish at their border, the spline is scipy.ndimage's
     fine = ndimage.map_coordinates(values, np.mgrid[20:70:0.3, 20:70:0.3], order=3)
     a = (np.arange(20, 70, 0.3) - (len(values) - 1) / 2) / 4
-    assert SampledPSF(values, 4).density(a, a[:, None]) == pytest.approx(fine * ratio[inner].mean(), rel=0, abs=1e-8)
+    assert SampledPSF(values, 4).density(a, a[:, None]) == pytest.approx(
+        fine * ratio[inner].mean(), rel=0, abs=1e-8
+    )
 
 
 def test_sampled_gaussian_is_nearly_the_gaussian() -> None:
     """With samples 1/8 sigma apart the spline errs by (1/8)^4 / 384 times the fourth derivatives, 6 together: 4e-6 of the peak."""
     x = np.arange(-56, 57) / 4
-    model = ForwardModel(Detector(SHAPE), star(3.3, -2.4, 1e4), SampledPSF(np.exp(-(x**2 + x[:, None] ** 2) / 8), 4), MIRRORED)
-    exact = ForwardModel(Detector(SHAPE), model.sources, GaussianPSF(2.0), MIRRORED).expected_counts(np.zeros(12))
+    model = ForwardModel(
+        Detector(SHAPE),
+        star(3.3, -2.4, 1e4),
+        SampledPSF(np.exp(-(x**2 + x[:, None] ** 2) / 8), 4),
+        MIRRORED,
+    )
+    exact = ForwardModel(
+        Detector(SHAPE), model.sources, GaussianPSF(2.0), MIRRORED
+    ).expected_counts(np.zeros(12))
     assert model.psf.sigma == pytest.approx(2.0, rel=1e-3)
-    assert model.expected_counts(np.zeros(12)) == pytest.approx(exact, rel=0, abs=4e-6 * exact.max())
+    assert model.expected_counts(np.zeros(12)) == pytest.approx(
+        exact, rel=0, abs=4e-6 * exact.max()
+    )
 
 
 @pytest.mark.parametrize("log", [False, True])
 def test_distortion_that_is_not_polynomial_has_any_psf(psf: PSF, log: bool) -> None:
     distortion = LogDistortion(1e-9) if log else MIRRORED  # so weak that there is none
-    counts = ForwardModel(Detector((30, 35)), star(2.0, -3.0, 1e3), psf, distortion).expected_counts(np.zeros(0 if log else 12))
-    expected = 1e3 * formula(psf, *(np.meshgrid(*oracles.impulse_nodes((30, 35))) - np.array([2.0, -3.0])[:, None, None]))
+    counts = ForwardModel(
+        Detector((30, 35)), star(2.0, -3.0, 1e3), psf, distortion
+    ).expected_counts(np.zeros(0 if log else 12))
+    expected = 1e3 * formula(
+        psf, *(np.meshgrid(*oracles.impulse_nodes((30, 35))) - np.array([2.0, -3.0])[:, None, None])
+    )
     assert counts == pytest.approx(expected, rel=0, abs=1e-6 * expected.max())
 
 
 @pytest.mark.parametrize("binning", [1, 2])
 @pytest.mark.parametrize(
-    "psf", [MoffatPSF(1.6, 1.5), MoffatPSF(2.5, 4.0), SampledPSF(lopsided(1.0, 7), 7)], ids=["1.5", "4", "sampled"]
+    "psf",
+    [MoffatPSF(1.6, 1.5), MoffatPSF(2.5, 4.0), SampledPSF(lopsided(1.0, 7), 7)],
+    ids=["1.5", "4", "sampled"],
 )
 def test_box_pixels_equal_fine_quadrature(psf: PSF, binning: int) -> None:
     """A spline is no polynomial within a pixel: where samples are 1/7 sigma apart that costs 1e-5 of the peak."""
     rng = np.random.default_rng(82)
     detector = Detector((22, 29), binning, "box")
-    model = ForwardModel(detector, random_sources(rng, detector.fine_shape, 3), psf, MIRRORED, tolerance=0.0)
+    model = ForwardModel(
+        detector, random_sources(rng, detector.fine_shape, 3), psf, MIRRORED, tolerance=0.0
+    )
     theta = random_theta(rng, MIRRORED, detector.fine_shape, 0.2)
     order = 16
     weights = np.polynomial.legendre.leggauss(order)[1] / 2
     image = dense(model, theta, oracles.box_nodes(detector.shape, binning, order))
-    image *= np.tile(weights, detector.fine_shape[1]) * np.tile(weights, detector.fine_shape[0])[:, None]
+    image *= (
+        np.tile(weights, detector.fine_shape[1]) * np.tile(weights, detector.fine_shape[0])[:, None]
+    )
     expected = oracles.bin_fine(image, binning * order)
     allowed = 1e-5 if isinstance(psf, SampledPSF) else 1e-6
-    assert model.expected_counts(theta) == pytest.approx(expected, rel=0, abs=allowed * expected.max())
+    assert model.expected_counts(theta) == pytest.approx(
+        expected, rel=0, abs=allowed * expected.max()
+    )
 
 
 def test_jacobian_equals_central_differences(psf: PSF) -> None:
     rng = np.random.default_rng(83)
     for detector in (Detector((40, 51)), Detector((20, 25), 2, "box")):
-        model = ForwardModel(detector, random_sources(rng, detector.fine_shape, 3), psf, MIRRORED, tolerance=0.0)
+        model = ForwardModel(
+            detector, random_sources(rng, detector.fine_shape, 3), psf, MIRRORED, tolerance=0.0
+        )
         assert_jacobian_is_right(model, random_theta(rng, MIRRORED, detector.fine_shape, 0.5))
 
 
@@ -176,32 +222,45 @@ def test_jacobian_equals_central_differences(psf: PSF) -> None:
 def test_unit_volume() -> None:
     for beta in (1.5, 3.0, 90.0):
         moffat_psf = MoffatPSF(3.0, beta)
-        volume, _ = integrate.quad(lambda r, p=moffat_psf: 2 * np.pi * r * p.density(r, 0.0), 0, np.inf)
+        volume, _ = integrate.quad(
+            lambda r, p=moffat_psf: 2 * np.pi * r * p.density(r, 0.0), 0, np.inf
+        )
         assert volume == pytest.approx(1.0, abs=1e-8)
     sampled = KINDS["sampled"]
-    x = np.arange(-200, 200) / 12 + 0.01  # cubic splines' sums over three samples a step are their integrals
+    x = (
+        np.arange(-200, 200) / 12 + 0.01
+    )  # cubic splines' sums over three samples a step are their integrals
     assert sampled.density(x, x[:, None]).sum() / 144 == pytest.approx(1.0, abs=1e-6)
     assert sampled.density(20.0, 0.0) == 0.0
-    counts = ForwardModel(Detector((81, 81)), star(0.2, 0.3, 1.0), sampled, MIRRORED).expected_counts(np.zeros(12))
+    counts = ForwardModel(
+        Detector((81, 81)), star(0.2, 0.3, 1.0), sampled, MIRRORED
+    ).expected_counts(np.zeros(12))
     assert counts.sum() == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-5])
 @pytest.mark.parametrize("shift", [1.0, 6.0])
-def test_every_pixel_above_the_tolerance_is_present(psf: PSF, shift: float, tolerance: float) -> None:
+def test_every_pixel_above_the_tolerance_is_present(
+    psf: PSF, shift: float, tolerance: float
+) -> None:
     rng = np.random.default_rng(84)
     tried = truncated = 0
     shape = (90, 110)
     while tried < 8:
         theta = random_theta(rng, MIRRORED, shape, shift)
-        model = ForwardModel(Detector(shape), random_sources(rng, shape, 1), psf, MIRRORED, tolerance=tolerance)
+        model = ForwardModel(
+            Detector(shape), random_sources(rng, shape, 1), psf, MIRRORED, tolerance=tolerance
+        )
         determinant = fine_determinant(model, theta, 0)
         if determinant.min() <= 0.0:
             continue
         tried += 1
         expected, counts = impulse(model, theta), model.expected_counts(theta)
         truncated += (counts == 0.0).mean() > 0.1
-        missed = np.abs(counts - expected) > tolerance * model.sources.flux[0] * psf.peak * determinant + EXACT * expected.max()
+        missed = (
+            np.abs(counts - expected)
+            > tolerance * model.sources.flux[0] * psf.peak * determinant + EXACT * expected.max()
+        )
         assert not missed.any(), f"{missed.sum()} pixels, {theta.tolist()}"
     assert truncated > 3  # a window as large as the frame would prove nothing
 
@@ -218,11 +277,16 @@ def test_windows_are_little_larger_than_needed(psf: PSF) -> None:
 
 CASES = {
     "scale": (Nuisances("scale", offset=True, psf_sigma=True), Detector(SHAPE)),
-    "free, scattered, box": (Nuisances("free", psf_sigma=True, position_scatter=True), Detector((30, 37), 2, "box")),
+    "free, scattered, box": (
+        Nuisances("free", psf_sigma=True, position_scatter=True),
+        Detector((30, 37), 2, "box"),
+    ),
 }
 
 
-def make_posterior(psf: PSF, nuisances: Nuisances, detector: Detector, seed: int) -> tuple[Posterior, Floats]:
+def make_posterior(
+    psf: PSF, nuisances: Nuisances, detector: Detector, seed: int
+) -> tuple[Posterior, Floats]:
     """A frame of nine sources drawn from the model itself, which the tests above hold to the formulas."""
     rng = np.random.default_rng(seed)
     model = ForwardModel(detector, SourceCatalog.grid(3, 17.0, 2e4), psf, MIRRORED, tolerance=0.0)
@@ -239,15 +303,22 @@ def test_gradient_is_that_of_log_prob(psf: PSF, case: str) -> None:
     posterior, truth = make_posterior(psf, *CASES[case], 85)
     scale = errors(posterior, truth)
     params = truth + 0.5 * scale * np.random.default_rng(85).uniform(-1, 1, truth.size)
-    numerical = [five_point(posterior.log_prob, params, k, STEP * scale[k]) for k in range(truth.size)]
-    assert posterior.gradient(params) * scale == pytest.approx(np.array(numerical) * scale, rel=1e-6, abs=1e-6)
+    numerical = [
+        five_point(posterior.log_prob, params, k, STEP * scale[k]) for k in range(truth.size)
+    ]
+    assert posterior.gradient(params) * scale == pytest.approx(
+        np.array(numerical) * scale, rel=1e-6, abs=1e-6
+    )
 
 
 def test_fisher_is_that_of_the_images(psf: PSF) -> None:
     """With the PSF's width among the parameters."""
     posterior, params = make_posterior(psf, *CASES["scale"], 86)
     scale = errors(posterior, params)
-    columns = [five_point(posterior.expected_counts, params, k, STEP * scale[k]) * scale[k] for k in range(params.size)]
+    columns = [
+        five_point(posterior.expected_counts, params, k, STEP * scale[k]) * scale[k]
+        for k in range(params.size)
+    ]
     jacobian = np.stack(columns).reshape(params.size, -1)
     expected = jacobian / posterior.expected_counts(params).ravel() @ jacobian.T
     assert posterior.fisher(params) * np.outer(scale, scale) == pytest.approx(expected, abs=1e-7)
@@ -264,7 +335,9 @@ def test_width_is_that_of_a_wider_psf() -> None:
         assert wider.psf.sigma == pytest.approx(truth[k], rel=1e-3)
         truth[k] = 1.1 * psf.sigma
         expected = wider.expected_counts(truth[:12], 3.0)
-        assert posterior.expected_counts(truth) == pytest.approx(expected, rel=0, abs=1e-12 * expected.max())
+        assert posterior.expected_counts(truth) == pytest.approx(
+            expected, rel=0, abs=1e-12 * expected.max()
+        )
 
 
 def test_refits_scatter_as_the_covariance_says(psf: PSF) -> None:
@@ -332,8 +405,11 @@ def test_run_files_name_any_psf(tmp_path: Path) -> None:
     run_file = tmp_path / "run.toml"
 
     def named(section: str) -> PSF:
-        run_file.write_text(example.replace('kind = "gaussian"', "").replace("sigma = 10.0", section), encoding="utf-8")
-        return assembly.reference_psf(settings.read_settings(run_file), run_file)
+        run_file.write_text(
+            example.replace('kind = "gaussian"', "").replace("sigma = 10.0", section),
+            encoding="utf-8",
+        )
+        return build.reference_psf(settings.read_settings(run_file), run_file)
 
     assert named("sigma = 2.5") == GaussianPSF(2.5)
     assert named('kind = "moffat"\nfwhm = 4.0\nbeta = 3.0') == MoffatPSF(4.0, 3.0)
@@ -351,7 +427,11 @@ def test_run_files_name_any_psf(tmp_path: Path) -> None:
         np.save(tmp_path / "psf.npy", array)
         if words is None:
             psf = named(sampled)
-            assert isinstance(psf, SampledPSF) and np.array_equal(psf.values, values) and psf.oversampling == 4.0
+            assert (
+                isinstance(psf, SampledPSF)
+                and np.array_equal(psf.values, values)
+                and psf.oversampling == 4.0
+            )
         else:
             with pytest.raises(InputError, match=rf"psf\.npy: .*{words}"):
                 named(sampled)
@@ -398,11 +478,17 @@ def test_bad_psfs_are_refused() -> None:
 # Measuring a PSF
 
 
-def spot(sigma: float, position: tuple[float, float], flux: float, background: float, pixel: str = "impulse") -> Floats:
+def spot(
+    sigma: float,
+    position: tuple[float, float],
+    flux: float,
+    background: float,
+    pixel: str = "impulse",
+) -> Floats:
     detector = Detector((71, 80), pixel=pixel)  # type: ignore[arg-type]
-    return ForwardModel(detector, star(*position, flux), GaussianPSF(sigma), MIRRORED, tolerance=0.0).expected_counts(
-        np.zeros(12), background
-    )
+    return ForwardModel(
+        detector, star(*position, flux), GaussianPSF(sigma), MIRRORED, tolerance=0.0
+    ).expected_counts(np.zeros(12), background)
 
 
 @pytest.mark.parametrize("sigma", [2.0, 3.0])
@@ -410,19 +496,33 @@ def spot(sigma: float, position: tuple[float, float], flux: float, background: f
 def test_measured_psf_is_the_true_one_without_noise(sigma: float, oversampling: int) -> None:
     """Aliases of a Gaussian are below exp(-pi^2 sigma^2 / 2) of its peak, 3e-9 at sigma 2; the window's border is below 4e-8."""
     position, half_width = (0.37, -1.45), round(6.5 * sigma)
-    psf = SampledPSF.measured(spot(sigma, position, 1e4, 7.0), position, half_width, background=7.0, oversampling=oversampling)
+    psf = SampledPSF.measured(
+        spot(sigma, position, 1e4, 7.0),
+        position,
+        half_width,
+        background=7.0,
+        oversampling=oversampling,
+    )
     n = (len(psf.values) - 1) // 2
     assert n == (2 * half_width - 1) * oversampling // 2
     a = np.arange(-n, n + 1) / oversampling
     true = 1e4 * GaussianPSF(sigma).density(a, a[:, None])
     assert psf.values == pytest.approx(true, rel=0, abs=1e-7 * true.max())
     # negative control: measured around a point 0.01 pixel away it is not
-    off = SampledPSF.measured(spot(sigma, position, 1e4, 7.0), (0.38, -1.45), half_width, background=7.0, oversampling=oversampling)
+    off = SampledPSF.measured(
+        spot(sigma, position, 1e4, 7.0),
+        (0.38, -1.45),
+        half_width,
+        background=7.0,
+        oversampling=oversampling,
+    )
     assert np.abs(off.values - true).max() > 1e-3 * true.max()
     if oversampling > 1:
         fine = np.linspace(-3 * sigma, 3 * sigma, 57)
         exact = GaussianPSF(sigma).density(fine, fine[:, None])
-        assert psf.density(fine, fine[:, None]) == pytest.approx(exact, rel=0, abs=(2 / sigma) ** 4 * 5e-6 * exact.max())
+        assert psf.density(fine, fine[:, None]) == pytest.approx(
+            exact, rel=0, abs=(2 / sigma) ** 4 * 5e-6 * exact.max()
+        )
 
 
 def test_measured_psf_s_noise_is_that_of_the_counts() -> None:
@@ -432,7 +532,10 @@ def test_measured_psf_s_noise_is_that_of_the_counts() -> None:
     n = 2 * half_width + 1
     window = mean[35 - half_width : 35 + half_width + 1, 40 - half_width : 40 + half_width + 1]
     turns = 2j * np.pi * np.fft.fftfreq(n)[:, None]
-    squares = [np.fft.ifft(np.exp(turns * by) * np.fft.fft(np.eye(n), axis=0), axis=0).real ** 2 for by in (0.37, -0.21)]
+    squares = [
+        np.fft.ifft(np.exp(turns * by) * np.fft.fft(np.eye(n), axis=0), axis=0).real ** 2
+        for by in (0.37, -0.21)
+    ]
     variance = squares[1] @ window @ squares[0].T
     at = np.arange(-14, 15)
     true = 1e5 * GaussianPSF(2.0).density(at, at[:, None])
@@ -468,7 +571,9 @@ def test_pixels_are_taken_out_of_the_frame_before_a_psf_is_measured() -> None:
         ((0.0, 0.0), 15, "sum of"),
     ],
 )
-def test_spots_that_cannot_be_measured_are_refused(position: tuple[float, float], half_width: int, words: str) -> None:
+def test_spots_that_cannot_be_measured_are_refused(
+    position: tuple[float, float], half_width: int, words: str
+) -> None:
     with pytest.raises(InputError, match=words):
         SampledPSF.measured(np.zeros((71, 80)), position, half_width)
     with pytest.raises(InputError, match="two dimensions"):
@@ -477,7 +582,11 @@ def test_spots_that_cannot_be_measured_are_refused(position: tuple[float, float]
 
 def test_width_is_that_of_the_gaussian_as_wide_at_half_maximum() -> None:
     assert MoffatPSF(3.0, 2.5).sigma == 3.0 / FWHM
-    assert MoffatPSF(3.0, 2.5).density(1.5, 0.0) == pytest.approx(0.5 * MoffatPSF(3.0, 2.5).peak, rel=1e-14)
+    assert MoffatPSF(3.0, 2.5).density(1.5, 0.0) == pytest.approx(
+        0.5 * MoffatPSF(3.0, 2.5).peak, rel=1e-14
+    )
     x = np.arange(-60, 61) / 6
     for true in (MoffatPSF(3.0, 2.5), GaussianPSF(1.2)):
-        assert SampledPSF(true.density(x, x[:, None]), 6).sigma == pytest.approx(true.sigma, rel=2e-3)
+        assert SampledPSF(true.density(x, x[:, None]), 6).sigma == pytest.approx(
+            true.sigma, rel=2e-3
+        )

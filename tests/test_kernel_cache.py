@@ -17,7 +17,7 @@ from bayesfred.imaging.kernels import compilation
 if "numba alone" in sys.argv:
     compilation._Cache = compilation.FunctionCache
 import bayesfred as bf
-from bayesfred.imaging.kernels.maps import image_positions
+from bayesfred.imaging.kernels.geometry import image_positions
 model = bf.ForwardModel(
     bf.Detector((65, 65)), bf.SourceCatalog([20.0], [10.0], [1e4]), bf.GaussianPSF(3.0),
     bf.PolynomialDistortion([(2, 0, 0, 0)], []))
@@ -27,7 +27,11 @@ print(image_positions(model.optics(), model.sources.x * 5e-5, 0.0, 0.0, 3.0)[0, 
 
 def position(package: Path, *arguments: str) -> float:
     """Where the copy of the package images a source."""
-    env = {name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "PYTHONPATH")}
+    env = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("NUMBA_CACHE_DIR", "PYTHONPATH")
+    }
     command, folder = [sys.executable, "-c", RUN, *arguments], package.parent
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=True)
     return float(done.stdout)
@@ -37,10 +41,14 @@ def position(package: Path, *arguments: str) -> float:
 def test_an_edited_kernel_is_compiled_again(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     """Negative control: with numba's own cache the edit goes unnoticed in the module that calls the kernel."""
     package = tmp_path / "bayesfred"
-    shutil.copytree(Path(bayesfred.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        Path(bayesfred.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
     assert position(package, *arguments) == pytest.approx(19.6, abs=1e-9)
     kernel = package / "imaging" / "kernels" / "polynomials.py"
     text = kernel.read_text(encoding="utf-8")
     assert text.count("return value, c_u, c_v") == 1
-    kernel.write_text(text.replace("return value, c_u, c_v", "return value + 1.0, c_u, c_v"), encoding="utf-8")
+    kernel.write_text(
+        text.replace("return value, c_u, c_v", "return value + 1.0, c_u, c_v"), encoding="utf-8"
+    )
     assert position(package, *arguments) == pytest.approx(19.6 if arguments else 18.6, abs=1e-9)

@@ -1,6 +1,7 @@
 """The paper's numbers made anew: the quick part of `examples/paper` against its committed README, and against what must come out.
 
-Where a number has an error, tolerances are in units of it: the row's own posterior standard deviation.
+Where a number has an error, tolerances are in units of it: the row's own posterior standard
+deviation.
 """
 
 import importlib
@@ -38,7 +39,7 @@ def value(row: Any) -> float:
     return float(re.findall(NUMBER, row.ours)[0])
 
 
-# ----------------------------------------------------------------------------------------------------------- the committed README
+# --------------------------------------------------------------------------------------------------
 
 
 def committed(text: str) -> dict[str, tuple[str, str]]:
@@ -55,8 +56,8 @@ def committed(text: str) -> dict[str, tuple[str, str]]:
 def close(one: str, other: str) -> bool:
     """Whether two cells say the same: within a tenth of the error that they state, or a hundredth where they state none.
 
-    An error itself may differ by 15 %, those of the Laplace approximation from those of a thousand draws. "about" is the size of
-    a rounding error, which is up to the machine.
+    An error itself may differ by 15 %, those of the Laplace approximation from those of a thousand
+    draws. "about" is the size of a rounding error, which is up to the machine.
     """
     if "about" in one and "about" in other:
         return True
@@ -71,7 +72,9 @@ def close(one: str, other: str) -> bool:
 
 def last_digit(cell: str) -> float:
     """One unit of the last digit that the first number has."""
-    mantissa, _, power = re.findall(NUMBER, cell)[0].partition("e") if re.findall(NUMBER, cell) else ("0", "", "")
+    mantissa, _, power = (
+        re.findall(NUMBER, cell)[0].partition("e") if re.findall(NUMBER, cell) else ("0", "", "")
+    )
     return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
 
 
@@ -93,7 +96,9 @@ def test_readme_says_what_comes_out(name: str) -> None:
 
 def test_readme_that_says_something_else_is_noticed() -> None:
     """Negative control: a coefficient half a standard deviation off, another verdict, a row that is not there."""
-    line = next(line for line in README.splitlines() if line.startswith("| λ = 10, paper's noise: f_vx,"))
+    line = next(
+        line for line in README.splitlines() if line.startswith("| λ = 10, paper's noise: f_vx,")
+    )
     number, sd = (float(n) for n in re.findall(NUMBER, line.split("|")[3]))
     for edited in (
         line.replace(line.split("|")[3], f" {number + 0.5 * sd:.3f} ± {sd} "),
@@ -108,12 +113,18 @@ def test_readme_lists_every_printed_number() -> None:
     """All rows of Table 2, and those of Table 3: 12 coefficients in one cell without noise, each by itself with it."""
     known = committed(README)
     assert sum("paper's noise: " in key and ", 1e-6" in key for key in known) == 36
-    assert sum("Table 3" in key and re.search(r": [fg]_\w+, 1e-8$", key) is not None for key in known) == 24
+    assert (
+        sum("Table 3" in key and re.search(r": [fg]_\w+, 1e-8$", key) is not None for key in known)
+        == 24
+    )
     assert sum(re.search(r": k\d, 1e-5", key) is not None for key in known) == 16
-    assert all(f"pictures/{picture.name}" in README for picture in (ROOT / "examples" / "paper" / "pictures").glob("*.png"))
+    assert all(
+        f"pictures/{picture.name}" in README
+        for picture in (ROOT / "examples" / "paper" / "pictures").glob("*.png")
+    )
 
 
-# ----------------------------------------------------------------------------------------------------------------- what must hold
+# --------------------------------------------------------------------------------------------------
 
 
 def test_printed_errors_tell_how_columns_are_read() -> None:
@@ -124,7 +135,9 @@ def test_printed_errors_tell_how_columns_are_read() -> None:
         (common.ALTERNATIVE, "y"): (14.1, 12.2, 2.8),
     }
     for reading, expected in known.items():
-        assert table2.chi_square_of_printed_errors(*reading) == pytest.approx(expected, rel=0.001, abs=0.5)
+        assert table2.chi_square_of_printed_errors(*reading) == pytest.approx(
+            expected, rel=0.001, abs=0.5
+        )
     taken = table2.chi_square_of_printed_errors(common.COLUMNS, "y")
     assert sum(taken) < 36 + 3 * np.sqrt(72)  # 36 degrees of freedom
 
@@ -133,8 +146,12 @@ def test_columns_are_those_of_figure_2_and_of_the_pinhole() -> None:
     """Read as here, the printed truth is the function of Fig. 2b and the pinhole sees what the paper's saw."""
     powers = dict(zip(common.DISTORTION.names, common.truth("table2"), strict=True))
     printed = common.PRINTED["figure2"]["polynomial"]
-    assert {name[2:]: value for name, value in powers.items() if name[0] == "f" and value} == printed["f"]
-    assert {name[2:]: value for name, value in powers.items() if name[0] == "g" and value} == pytest.approx(printed["g"])
+    assert {
+        name[2:]: value for name, value in powers.items() if name[0] == "f" and value
+    } == printed["f"]
+    assert {
+        name[2:]: value for name, value in powers.items() if name[0] == "g" and value
+    } == pytest.approx(printed["g"])
     table3 = room("table3")
     k = np.array(table3.T["polynomial"]["k"])
     off = {
@@ -168,7 +185,8 @@ def test_reference_psf_of_a_lone_spot_is_exact() -> None:
 
 def test_reconstruction_without_noise_leaves_rounding() -> None:
     assert value(rows("figure6")["polynomial: V"]) < 1e-28
-    # coordinates u, x of 1500 pixels are rounded to 1e-13, a spot's values to 1e-14 and less: 324 pixels make some 1e-27
+    # coordinates u, x of 1500 pixels are rounded to 1e-13, a spot's values to 1e-14 and less: 324
+    # pixels make some 1e-27
     assert value(rows("table3")["polynomial: V, Fredholm"]) < 1e-25
     assert value(rows("table3")["polynomial: V, Fredholm, as mean over the pixels"]) <= 1e-28
     assert value(rows("table3")["polynomial: V, pinhole"]) > 0.1
@@ -178,10 +196,14 @@ def test_reconstruction_without_noise_leaves_rounding() -> None:
 def test_coefficients_lie_within_their_errors(kind: str) -> None:
     """36 of each kind: none is 4 standard deviations off, and their mean square is 1 within 4 of its own."""
     table = rows("table2")
-    z = deviations(table, kind, dict(zip(common.DISTORTION.names, common.truth("table2") / 1e-6, strict=True)))
+    z = deviations(
+        table, kind, dict(zip(common.DISTORTION.names, common.truth("table2") / 1e-6, strict=True))
+    )
     assert z.size == 36 and np.abs(z).max() < 4.0
     # negative control: the truth in the other order of columns
-    other = dict(zip(common.read_as(common.ALTERNATIVE).names, common.truth("table2") / 1e-6, strict=True))
+    other = dict(
+        zip(common.read_as(common.ALTERNATIVE).names, common.truth("table2") / 1e-6, strict=True)
+    )
     assert np.abs(deviations(table, kind, other)).max() > 40.0
 
 
@@ -198,11 +220,16 @@ def deviations(table: dict[str, Any], kind: str, truth: dict[str, float]) -> Any
 def test_background_and_chi_square_lie_within_their_errors() -> None:
     for background in (5, 10, 50):
         for what, expected in (("λ estimate", background), ("χ²", 1.0)):
-            found, sd = (float(n) for n in re.findall(NUMBER, rows("table2")[f"λ = {background}, paper's noise: {what}"].ours))
+            found, sd = (
+                float(n)
+                for n in re.findall(
+                    NUMBER, rows("table2")[f"λ = {background}, paper's noise: {what}"].ours
+                )
+            )
             assert abs(found - expected) < 4.0 * sd
 
 
-# ------------------------------------------------------------------------------------------------------------------ longer runs
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.statistics
@@ -211,7 +238,9 @@ def test_coverage_with_the_pixel_in_the_model_and_in_the_frame() -> None:
     sampling = room("sampling")
     frame, chi2_frame, model, chi2_model = sampling.errors_in_units(200)
     assert np.sqrt(np.mean(model**2)) == pytest.approx(1.0, abs=4 * 0.025)
-    assert np.sqrt(np.mean(frame**2)) == pytest.approx(1.0 / sampling.quoted_over_true(sampling.NARROW), rel=4 * 0.025)
+    assert np.sqrt(np.mean(frame**2)) == pytest.approx(
+        1.0 / sampling.quoted_over_true(sampling.NARROW), rel=4 * 0.025
+    )
     assert np.mean(frame**2) > np.mean(model**2)  # of the same frames
     assert chi2_model.mean() == pytest.approx(1.0, abs=0.02) and chi2_frame.mean() > 1.5
 

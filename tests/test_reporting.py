@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.imaging.scene import SourceCatalog
-from bayesfred.inference.posterior import Nuisances
+from bayesfred.model.posterior import Nuisances
 from bayesfred.reporting import plots
 from bayesfred.reporting.html import write_report
 
@@ -35,7 +35,9 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
     """A chain of independent draws around the truth and its posterior: the attributes the report reads."""
     rng = np.random.default_rng(1)
     distortion = PolynomialDistortion(((1, 0, 1, 0), (2, 0, 1, 0)), ((0, 1, 0, 1), (0, 2, 0, 1)))
-    model = ForwardModel(Detector((61, 81)), SourceCatalog.grid(3, 20.0, 3000.0), GaussianPSF(2.5), distortion)
+    model = ForwardModel(
+        Detector((61, 81)), SourceCatalog.grid(3, 20.0, 3000.0), GaussianPSF(2.5), distortion
+    )
     names = (*distortion.names, "background", *names_extra)
     counts = rng.poisson(model.expected_counts(TRUTH, BACKGROUND)).astype(float)
     centre = np.concatenate([TRUTH, [BACKGROUND], np.zeros(len(names_extra))])
@@ -55,7 +57,9 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         expected_counts=lambda params: model.expected_counts(params[:4], params[4]),
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
     )
-    estimate = SimpleNamespace(params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9)
+    estimate = SimpleNamespace(
+        params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9
+    )
     fields = {
         "path": Path("chains/a & b.h5"),
         "parameter_names": names,
@@ -127,7 +131,9 @@ def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
     text, page = report(tmp_path, truth=np.append(TRUTH, BACKGROUND))
     assert not page.open
     assert "script" not in page.tags and "link" not in page.tags
-    assert len(page.links) == 4 and all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert len(page.links) == 4 and all(
+        link.startswith("data:image/png;base64,") for link in page.links
+    )
     assert "http" not in re.sub(r"data:image/png;base64,[^\"]*", "", text)
     for link in page.links:
         image = imread(BytesIO(base64.b64decode(link.split(",")[1])))
@@ -136,8 +142,14 @@ def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
 
 
 def test_page_says_what_it_must(tmp_path: Path) -> None:
-    _, page = report(tmp_path, truth=np.append(TRUTH, BACKGROUND), notes=["Seen at dusk."], settings='{"seed": 7}')
-    for words in ("converged: R-hat at most", "truth", "ESS bulk", "Pearson", "Deviance", "Seen at dusk.",
+    _, page = report(
+        tmp_path,
+        truth=np.append(TRUTH, BACKGROUND),
+        notes=["Seen at dusk."],
+        settings='{"seed": 7}',
+    )
+    for words in ("converged: R-hat at "
+                  "most", "truth", "ESS bulk", "Pearson", "Deviance", "Seen at dusk.",
                   '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5",
                   "Prior-dominated: none."):  # fmt: skip
         assert words in page.text
@@ -219,7 +231,9 @@ def test_labels_carry_power_and_unit(name: str, label: str) -> None:
 def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:
     chain, _ = run()
     truth = np.append(TRUTH, BACKGROUND)
-    figure = plots.corner_plot(chain.draws(), chain.parameter_names, truth=truth, estimate=chain.estimate.params)
+    figure = plots.corner_plot(
+        chain.draws(), chain.parameter_names, truth=truth, estimate=chain.estimate.params
+    )
     assert len(figure.axes) == 25
     assert "10^{-6}" in figure.axes[-4].get_xlabel()
     assert "background" in figure.axes[-1].get_xlabel()
@@ -268,7 +282,9 @@ def test_triptych_axes_count_pixels_from_the_middle(shape: tuple[int, int]) -> N
     assert residual.images[0].get_clim() == (-5.0, 5.0)
     shown = values(residual)
     assert np.ma.count(shown) == mask.sum()
-    assert float(shown[ny // 4, nx // 4]) == pytest.approx(float((counts - expected)[ny // 4, nx // 4] / 4000.0**0.5 / 2.0))
+    assert float(shown[ny // 4, nx // 4]) == pytest.approx(
+        float((counts - expected)[ny // 4, nx // 4] / 4000.0**0.5 / 2.0)
+    )
     pixels(figure)
 
 
@@ -276,12 +292,18 @@ def test_star_panels_show_the_brightest_inside_the_frame() -> None:
     expected = np.ones((40, 60))
     expected[10, 20], expected[39, 59] = 100.0, 50.0
     u, v = np.array([20, 59, 5, 500, np.nan]) - 29.5, np.array([10, 39, 5, 0, 0]) - 19.5
-    figure = plots.star_panels(expected + 3.0, expected, expected**0.5, np.ones(expected.shape, bool), u, v, half_width=3)
-    stamps = [ax for ax in figure.axes if ax.images and ax.get_xlabel() == "" and len(values(ax)) == 7]
+    figure = plots.star_panels(
+        expected + 3.0, expected, expected**0.5, np.ones(expected.shape, bool), u, v, half_width=3
+    )
+    stamps = [
+        ax for ax in figure.axes if ax.images and ax.get_xlabel() == "" and len(values(ax)) == 7
+    ]
     assert len(stamps) == 9
     brightest, difference = values(stamps[0]), values(stamps[2])
     assert float(brightest[3, 3]) == 103.0
-    assert float(difference[3, 3]) == pytest.approx(0.3) and float(difference[0, 0]) == pytest.approx(3.0)
+    assert float(difference[3, 3]) == pytest.approx(0.3) and float(
+        difference[0, 0]
+    ) == pytest.approx(3.0)
     corner = values(stamps[3])
     assert float(corner[3, 3]) == 53.0 and np.ma.count(corner) == 16
     pixels(figure)
@@ -315,7 +337,13 @@ def test_overview_shows_frame_and_marginals(with_truth: bool) -> None:
     truth = np.append(TRUTH, BACKGROUND) if with_truth else None
     expected = posterior.expected_counts(chain.estimate.params)
     figure = plots.overview(
-        posterior.counts, expected, expected**0.5, posterior.mask, chain.draws(), chain.parameter_names, truth=truth
+        posterior.counts,
+        expected,
+        expected**0.5,
+        posterior.mask,
+        chain.draws(),
+        chain.parameter_names,
+        truth=truth,
     )
     marginals = next(ax for ax in figure.axes if "posterior mean" in ax.get_ylabel())
     assert len(marginals.get_xticks()) == (5 if with_truth else 4)

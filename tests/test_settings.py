@@ -49,14 +49,20 @@ def is_section(kind: Any) -> bool:
 def test_defaults(tmp_path: Path) -> None:
     settings = read(tmp_path)
     assert settings.model_dump(exclude_none=True) == {
-        "frame": {"path": "frame.fits", "pedestal": 0.0, "sigma_clip": False},
+        "frame": {"path": "frame.fits", "pedestal": 0.0, "reject_outliers": False},
         "catalogue": {"path": "stars.csv", "x": "x", "y": "y", "flux": "flux"},
         "detector": {"pixel": "impulse", "binning": 1},
         "psf": {"kind": "gaussian", "sigma": 2.0},
         "distortion": {"terms": "mirrored"},
         "model": {"conserve_flux": True, "tolerance": 1e-8},
         "noise": {"kind": "poisson", "read_noise": 0.0},
-        "nuisances": {"flux": "fixed", "offset": False, "psf_sigma": False, "background_order": 0, "position_scatter": False},
+        "nuisances": {
+            "flux": "fixed",
+            "offset": False,
+            "psf_sigma": False,
+            "background_order": 0,
+            "position_scatter": False,
+        },
         "prior": {},
         "sampling": {"seed": 1, "ensembles": 4, "walkers": 32, "target_ess": 1000},
         "output": {},
@@ -85,11 +91,15 @@ def test_example_names_every_key(tmp_path: Path) -> None:
     table = tomllib.loads(text)
     assert set(table) == set(RunSettings.model_fields)
     for name, field in RunSettings.model_fields.items():
-        section = next(kind for kind in (field.annotation, *get_args(field.annotation)) if is_section(kind))
+        section = next(
+            kind for kind in (field.annotation, *get_args(field.annotation)) if is_section(kind)
+        )
         assert name == "prior" or set(table[name]) == set(section.model_fields)
     # All of them at once, but for the keys that exclude others, are a run file.
     path = tmp_path / "run.toml"
-    path.write_text(re.sub(r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling) = |path = \"psf)", "# ", text))
+    path.write_text(
+        re.sub(r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling) = |path = \"psf)", "# ", text)
+    )
     settings = read_settings(path)
     assert settings.prior["f_ux"].keywords == {"loc": 0.0, "scale": 1e-5}
     assert settings.catalogue.zero_point == 25.0
@@ -127,9 +137,21 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         ("frame", 'path = "a"\ngain = 0', "frame.gain: got 0, expected a number greater than 0"),
         ("frame", 'path = "a"\ngain = "2"', "frame.gain: got '2', expected a valid number"),
         ("frame", 'path = "a"\ngain = true', "frame.gain: got True, expected a valid number"),
-        ("frame", 'path = "a"\npedestal = inf', "frame.pedestal: got inf, expected a finite number"),
-        ("frame", 'path = "a"\nsaturation = nan', "frame.saturation: got nan, expected a finite number"),
-        ("frame", 'path = "a"\npedestel = 1', "frame.pedestel: unknown key, did you mean 'pedestal'?"),
+        (
+            "frame",
+            'path = "a"\npedestal = inf',
+            "frame.pedestal: got inf, expected a finite number",
+        ),
+        (
+            "frame",
+            'path = "a"\nsaturation = nan',
+            "frame.saturation: got nan, expected a finite number",
+        ),
+        (
+            "frame",
+            'path = "a"\npedestel = 1',
+            "frame.pedestel: unknown key, did you mean 'pedestal'?",
+        ),
         (
             "psf",
             "sigma = 2\nqqq = 1",
@@ -138,9 +160,21 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         ("psf", "sigma = -1.5", "psf.sigma: got -1.5, expected a number greater than 0"),
         ("psf", "", "psf: got no width, expected sigma with kind = 'gaussian'"),
         ("psf", "fwhm = 2", "psf: got fwhm, expected sigma with kind = 'gaussian'"),
-        ("psf", 'kind = "moffat"\nfwhm = 2', "psf: got fwhm, expected fwhm and beta with kind = 'moffat'"),
-        ("psf", 'kind = "moffat"\nfwhm = 2\nbeta = 1', "psf.beta: got 1, expected a number greater than 1"),
-        ("psf", 'kind = "sampled"\nsigma = 2', "psf: got sigma, expected path and oversampling with kind = 'sampled'"),
+        (
+            "psf",
+            'kind = "moffat"\nfwhm = 2',
+            "psf: got fwhm, expected fwhm and beta with kind = 'moffat'",
+        ),
+        (
+            "psf",
+            'kind = "moffat"\nfwhm = 2\nbeta = 1',
+            "psf.beta: got 1, expected a number greater than 1",
+        ),
+        (
+            "psf",
+            'kind = "sampled"\nsigma = 2',
+            "psf: got sigma, expected path and oversampling with kind = 'sampled'",
+        ),
         (
             "psf",
             'kind = "sampled"\npath = "p.npy"\noversampling = 0.5',
@@ -153,10 +187,22 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
             "catalogue: got magnitude alone, expected magnitude and zero_point together",
         ),
         ("catalogue", 'path = "a"\nzero_point = 25', "catalogue: got zero_point alone"),
-        ("detector", 'pixel = "square"', "detector.pixel: got 'square', expected 'impulse' or 'box'"),
-        ("detector", "binning = 0", "detector.binning: got 0, expected a number greater than or equal to 1"),
+        (
+            "detector",
+            'pixel = "square"',
+            "detector.pixel: got 'square', expected 'impulse' or 'box'",
+        ),
+        (
+            "detector",
+            "binning = 0",
+            "detector.binning: got 0, expected a number greater than or equal to 1",
+        ),
         ("detector", "binning = 1.5", "detector.binning: got 1.5, expected a valid integer"),
-        ("distortion", "", "distortion: got no terms, expected either terms, or both f_terms and g_terms"),
+        (
+            "distortion",
+            "",
+            "distortion: got no terms, expected either terms, or both f_terms and g_terms",
+        ),
         ("distortion", "f_terms = [[1, 0, 0, 0]]", "distortion: got f_terms, expected either"),
         (
             "distortion",
@@ -164,14 +210,18 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
             "distortion: got terms and f_terms and g_terms, expected either",
         ),
         ("distortion", "f_terms = []\ng_terms = []", "distortion: got f_terms and g_terms empty"),
-        ("distortion", 'terms = "complete"', "distortion: got no degree"),
+        ("distortion", 'terms = "full_polynomial"', "distortion: got no degree"),
         (
             "distortion",
-            'terms = "complete"\ndegree = 1',
+            'terms = "full_polynomial"\ndegree = 1',
             "distortion.degree: got 1, expected a number greater",
         ),
         ("distortion", 'terms = "paper"\ndegree = 3', "distortion: got degree 3"),
-        ("distortion", 'terms = "papers"', "distortion.terms: got 'papers', expected 'mirrored', 'paper'"),
+        (
+            "distortion",
+            'terms = "papers"',
+            "distortion.terms: got 'papers', expected 'mirrored', 'paper'",
+        ),
         (
             "distortion",
             "f_terms = [[1, 0, 0]]\ng_terms = []",
@@ -188,14 +238,34 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
             "distortion.f_terms.0: got [1, 0, 0, 0, 0], expected one with at most 4 items",
         ),
         ("model", "tolerance = 1.0", "model.tolerance: got 1.0, expected a number less than 1"),
-        ("model", "tolerance = -1e-9", "model.tolerance: got -1e-09, expected a number greater than or"),
+        (
+            "model",
+            "tolerance = -1e-9",
+            "model.tolerance: got -1e-09, expected a number greater than or",
+        ),
         ("model", "conserve_flux = 1", "model.conserve_flux: got 1, expected a valid boolean"),
         ("noise", 'kind = "gauss"', "noise.kind: got 'gauss', expected 'poisson' or 'background'"),
-        ("noise", "read_noise = -1", "noise.read_noise: got -1, expected a number greater than or equal"),
+        (
+            "noise",
+            "read_noise = -1",
+            "noise.read_noise: got -1, expected a number greater than or equal",
+        ),
         ("noise", 'kind = "background"\nread_noise = 2.0', "noise: got read_noise 2.0"),
-        ("nuisances", 'flux = "none"', "nuisances.flux: got 'none', expected 'fixed', 'scale' or 'free'"),
-        ("nuisances", "background_order = 3", "nuisances.background_order: got 3, expected 0, 1 or 2"),
-        ("nuisances", "footprint = 0.0", "nuisances.footprint: got 0.0, expected a number greater than 0"),
+        (
+            "nuisances",
+            'flux = "none"',
+            "nuisances.flux: got 'none', expected 'fixed', 'scale' or 'free'",
+        ),
+        (
+            "nuisances",
+            "background_order = 3",
+            "nuisances.background_order: got 3, expected 0, 1 or 2",
+        ),
+        (
+            "nuisances",
+            "footprint = 0.0",
+            "nuisances.footprint: got 0.0, expected a number greater than 0",
+        ),
         ("nuisances", 'offset = "yes"', "nuisances.offset: got 'yes', expected a valid boolean"),
         ("prior", "f_ux = 3", "prior.f_ux: got 3, expected a table"),
         ("prior.f_ux", "scale = 1", "prior.f_ux.distribution: missing, expected a value"),
@@ -214,7 +284,11 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
             "ensembles = 1",
             "sampling.ensembles: got 1, expected a number greater than or equal to 2",
         ),
-        ("sampling", "walkers = 2", "sampling.walkers: got 2, expected a number greater than or equal to 4"),
+        (
+            "sampling",
+            "walkers = 2",
+            "sampling.walkers: got 2, expected a number greater than or equal to 4",
+        ),
         ("sampling", "walkers = 7", "sampling.walkers: got 7, expected a multiple of 2"),
         ("sampling", "target_ess = 0", "sampling.target_ess: got 0"),
         ("sampling", "steps = 0", "sampling.steps: got 0"),
@@ -222,27 +296,68 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         ("output", 'file = "a.h5"', "output.file: unknown key"),
         ("simulation", "theta = {}\nbackground = 1", "simulation.shape: missing, expected a value"),
         ("simulation", "shape = [0, 5]\ntheta = {}\nbackground = 1", "simulation.shape.0: got 0"),
-        ("simulation", "shape = [5, 5, 5]\ntheta = {}\nbackground = 1", "simulation.shape: got [5, 5, 5]"),
+        (
+            "simulation",
+            "shape = [5, 5, 5]\ntheta = {}\nbackground = 1",
+            "simulation.shape: got [5, 5, 5]",
+        ),
         (
             "simulation",
             "shape = [5, 5]\ntheta = {f_ux = nan}\nbackground = 1",
             "simulation.theta.f_ux: got nan",
         ),
-        ("simulation", "shape = [5, 5]\ntheta = {}\nbackground = -1", "simulation.background: got -1"),
+        (
+            "simulation",
+            "shape = [5, 5]\ntheta = {}\nbackground = -1",
+            "simulation.background: got -1",
+        ),
         (
             "simulation",
             "shape = [5, 5]\ntheta = {}\nbackground = 1\ngrid = {side = 2, spacing = 5, flu = 1}",
-            "simulation.grid.flux: missing, expected a value; simulation.grid.flu: unknown key, did you mean 'flux'?",
+            "simulation.grid.flux: missing, expected a value; simulation.grid.flu: unknown key, "
+            "did you mean 'flux'?",
         ),
-        ("frame", "path = 2000-01-01", "frame.path: got {'2000-01-01': 'date'}, expected a valid string"),
-        ("psf", "sigma = 1e300", "psf.sigma: got 1e+300, expected a number less than or equal to 1000000000000000"),
+        (
+            "frame",
+            "path = 2000-01-01",
+            "frame.path: got {'2000-01-01': 'date'}, expected a valid string",
+        ),
+        (
+            "psf",
+            "sigma = 1e300",
+            "psf.sigma: got 1e+300, expected a number less than or equal to 1000000000000000",
+        ),
         ("psf", f"sigma = 1{'0' * 400}", "psf.sigma: got "),
-        ("detector", "binning = 1001", "detector.binning: got 1001, expected a number less than or equal to 1000"),
-        ("distortion", 'terms = "complete"\ndegree = 11', "distortion.degree: got 11, expected a number less than or"),
-        ("distortion", "f_terms = [[1, 0, 11, 0]]\ng_terms = []", "distortion.f_terms.0.2: got 11, expected a number less"),
-        ("sampling", "walkers = 10002", "sampling.walkers: got 10002, expected a number less than or equal to 10000"),
-        ("sampling", "ensembles = 1001", "sampling.ensembles: got 1001, expected a number less than or equal to 1000"),
-        ("sampling", f"seed = {2**63}", f"sampling.seed: got {2**63}, expected a number less than {2**63}"),
+        (
+            "detector",
+            "binning = 1001",
+            "detector.binning: got 1001, expected a number less than or equal to 1000",
+        ),
+        (
+            "distortion",
+            'terms = "full_polynomial"\ndegree = 11',
+            "distortion.degree: got 11, expected a number less than or",
+        ),
+        (
+            "distortion",
+            "f_terms = [[1, 0, 11, 0]]\ng_terms = []",
+            "distortion.f_terms.0.2: got 11, expected a number less",
+        ),
+        (
+            "sampling",
+            "walkers = 10002",
+            "sampling.walkers: got 10002, expected a number less than or equal to 10000",
+        ),
+        (
+            "sampling",
+            "ensembles = 1001",
+            "sampling.ensembles: got 1001, expected a number less than or equal to 1000",
+        ),
+        (
+            "sampling",
+            f"seed = {2**63}",
+            f"sampling.seed: got {2**63}, expected a number less than {2**63}",
+        ),
         ("output", 'path = "run.png"', "output.path: got 'run.png', expected"),
         ("simulate", "seed = 1", "simulate: unknown key, did you mean 'simulation'?"),
         ("'a\\nb'", "seed = 1", "a\\nb: unknown key, expected one of frame, catalogue"),
@@ -254,11 +369,15 @@ def test_refusals(tmp_path: Path, section: str, keys: str, expected: str) -> Non
 
 def test_a_missing_section_and_several_mistakes(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
-    path.write_text('frame = 3\n[catalogue]\npath = "a"\n[psf]\nsigma = 0\n[distortion]\nterms = "paper"\n["x\\ny"]\n')
+    path.write_text(
+        'frame = 3\n[catalogue]\npath = "a"\n[psf]\nsigma = 0\n[distortion]\nterms = '
+        '"paper"\n["x\\ny"]\n'
+    )
     with pytest.raises(InputError) as caught:
         read_settings(path)
     assert str(caught.value).startswith(
-        f"{path}: frame: got 3, expected a table; psf.sigma: got 0, expected a number greater than 0; "
+        f"{path}: frame: got 3, expected a table; psf.sigma: got 0, expected a number greater "
+        "than 0; "
         "x y: unknown key, expected one of frame"
     )
 
@@ -295,7 +414,7 @@ def test_byte_order_mark_and_line_ends(tmp_path: Path) -> None:
 
 
 def test_resolve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs, data = tmp_path / "runs", tmp_path / "data"
+    runs, data = tmp_path / "commands", tmp_path / "data"
     runs.mkdir()
     data.mkdir()
     run_file = runs / "run.toml"
@@ -314,16 +433,35 @@ def test_resolve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "runs"
+    folder = tmp_path / "commands"
     (folder / "sub").mkdir(parents=True)
     (folder / "inner").symlink_to("sub")
     (folder / "outer").symlink_to(tmp_path)
     (folder / "up.h5").symlink_to(tmp_path / "a.h5")
     (folder / "circle").symlink_to("circle")
-    for path in ("a.h5", "sub/a.h5", "sub/../a.h5", "inner/a.h5", f"{folder}/a.h5", "outer/runs/a.h5"):
+    for path in (
+        "a.h5",
+        "sub/a.h5",
+        "sub/../a.h5",
+        "inner/a.h5",
+        f"{folder}/a.h5",
+        "outer/runs/a.h5",
+    ):
         assert within(folder, path, "where") == folder / path
-    for path in ("../a.h5", "sub/../../a.h5", "outer/a.h5", "up.h5", "circle/a.h5", f"{tmp_path}/a.h5", "/a.h5", "a\0.h5"):
-        with pytest.raises(InputError, match=r"^where: got .*, which leads out of .*runs, expected a path that stays inside$"):
+    for path in (
+        "../a.h5",
+        "sub/../../a.h5",
+        "outer/a.h5",
+        "up.h5",
+        "circle/a.h5",
+        f"{tmp_path}/a.h5",
+        "/a.h5",
+        "a\0.h5",
+    ):
+        with pytest.raises(
+            InputError,
+            match=r"^where: got .*, which leads out of .*runs, expected a path that stays inside$",
+        ):
             within(folder, path, "where")
     monkeypatch.chdir(folder)
     assert within(".", "a.h5", "where") == Path("a.h5")

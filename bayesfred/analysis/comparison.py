@@ -1,15 +1,17 @@
 """Which model predicts a frame best: leave-one-out predictive accuracy of every pixel, from the draws of each model's chain.
 
-A model is scored by elpd, the sum over pixels of log p(n_i | the other pixels). With draws theta_s of the whole frame's
-posterior, p(n_i | the others) is the harmonic mean of p(n_i | theta_s): leaving a pixel out weights the draws by
-1 / p(n_i | theta_s). A frame has so many pixels that hardly any weights differ: where all of a pixel's lie within a factor
-e^`SPREAD` their plain mean is known to a hundredth, and elsewhere their largest are replaced by those of a fitted Pareto
-distribution, whose shape says whether the weights can be trusted. Differences of elpd are judged by the scatter of the pixels'
-differences.
+A model is scored by elpd, the sum over pixels of log p(n_i | the other pixels). With draws theta_s
+of the whole frame's posterior, p(n_i | the others) is the harmonic mean of p(n_i | theta_s):
+leaving a pixel out weights the draws by 1 / p(n_i | theta_s). A frame has so many pixels that
+hardly any weights differ: where all of a pixel's lie within a factor e^`SPREAD` their plain mean is
+known to a hundredth, and elsewhere their largest are replaced by those of a fitted Pareto
+distribution, whose shape says whether the weights can be trusted. Differences of elpd are judged by
+the scatter of the pixels' differences.
 
 References
 ----------
-A. Vehtari, A. Gelman, J. Gabry (2017), Statistics and Computing 27, 1413: leave-one-out by importance sampling.
+A. Vehtari, A. Gelman, J. Gabry (2017), Statistics and Computing 27, 1413: leave-one-out by
+importance sampling.
 A. Vehtari et al. (2024), Journal of Machine Learning Research 25, 72: Pareto smoothing.
 T. Sivula, M. Magnusson, A. Vehtari (2020), arXiv:2008.10296: what a difference smaller than 4 says.
 """
@@ -23,9 +25,9 @@ from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
 from bayesfred.errors import InputError
-from bayesfred.inference.chainfile import Chain
-from bayesfred.inference.convergence import convergence
-from bayesfred.inference.posterior import Posterior
+from bayesfred.model.posterior import Posterior
+from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.convergence import convergence
 
 __all__ = ["Comparison", "Score", "compare"]
 
@@ -51,15 +53,19 @@ class Score:
     name : str
     n_parameters : int
     elpd, elpd_se : float
-        Expected log predictive density of the frame, leaving out one pixel at a time, and its standard error.
+        Expected log predictive density of the frame, leaving out one pixel at a time, and its
+        standard error.
     p_loo : float
         Effective number of parameters: how much better the model predicts pixels that it has seen.
     difference, difference_se : float
-        The best model's elpd less this one's, and its standard error from the pixels' differences; 0 for the best.
+        The best model's elpd less this one's, and its standard error from the pixels' differences;
+        0 for the best.
     pareto_k : float
-        Largest shape of a pixel's weights; -inf where no pixel's weights spread enough to have a tail.
+        Largest shape of a pixel's weights; -inf where no pixel's weights spread enough to have a
+        tail.
     n_unreliable : int
-        Pixels whose shape exceeds min(1 - 1 / log10(draws), 0.7): their part of elpd is not to be trusted.
+        Pixels whose shape exceeds min(1 - 1 / log10(draws), 0.7): their part of elpd is not to be
+        trusted.
     """
 
     name: str
@@ -82,8 +88,9 @@ class Comparison:
     scores : tuple of Score
         The best model first.
     chosen : str
-        The model with the fewest parameters among those that predict as well as the best: whose elpd is less than 4, or less
-        than twice the difference's standard error, below the best one's.
+        The model with the fewest parameters among those that predict as well as the best: whose
+        elpd is less than 4, or less than twice the difference's standard error, below the best
+        one's.
     """
 
     scores: tuple[Score, ...]
@@ -112,15 +119,17 @@ def compare(chains: Mapping[str, Chain], *, draws: int = 400) -> Comparison:
     Raises
     ------
     InputError
-        If there are fewer than two chains, their counts or masks differ, or a model's fluxes are free: these are fitted to
-        the very pixels that are to be predicted.
+        If there are fewer than two chains, their counts or masks differ, or a model's fluxes are
+        free: these are fitted to the very pixels that are to be predicted.
 
     References
     ----------
     A. Vehtari, A. Gelman, J. Gabry (2017), Statistics and Computing 27, 1413, Eq. 7 and 24.
     """
     if len(chains) < 2:
-        raise InputError(f"chains: got {len(chains)}, expected at least two models of one frame to compare")
+        raise InputError(
+            f"chains: got {len(chains)}, expected at least two models of one frame to compare"
+        )
     if draws < 100:
         raise InputError(f"draws: got {draws}, expected at least 100")
     posteriors = {name: chain.posterior() for name, chain in chains.items()}
@@ -128,13 +137,19 @@ def compare(chains: Mapping[str, Chain], *, draws: int = 400) -> Comparison:
     for name, posterior in posteriors.items():
         if posterior.nuisances.profiled:
             raise InputError(
-                f"{name}: fluxes: got free ones, fitted to the very pixels that are to be predicted, expected fixed or scaled "
+                f"{name}: fluxes: got free ones, fitted to the very pixels that are to be "
+                "predicted, expected fixed or scaled "
                 "fluxes: fit it again with these"
             )
         for what in ("counts", "mask"):
             if not np.array_equal(getattr(posterior, what), getattr(posteriors[first], what)):
-                raise InputError(f"{name}: {what}: got others than those of {first}, expected models of the same frame and pixels")
-    pointwise = {name: _leave_one_out(posteriors[name], chain, draws) for name, chain in chains.items()}
+                raise InputError(
+                    f"{name}: {what}: got others than those of {first}, expected models of the "
+                    "same frame and pixels"
+                )
+    pointwise = {
+        name: _leave_one_out(posteriors[name], chain, draws) for name, chain in chains.items()
+    }
     elpd = {name: float(np.sum(values[0])) for name, values in pointwise.items()}
     ranked = sorted(chains, key=lambda name: -elpd[name])
     best = pointwise[ranked[0]][0]
@@ -144,7 +159,18 @@ def compare(chains: Mapping[str, Chain], *, draws: int = 400) -> Comparison:
         behind = best - each
         difference = float(np.sum(behind)), _error_of_sum(behind)
         count = posteriors[name].n_parameters
-        scores.append(Score(name, count, elpd[name], _error_of_sum(each), p_loo, *difference, shape, n_unreliable))
+        scores.append(
+            Score(
+                name,
+                count,
+                elpd[name],
+                _error_of_sum(each),
+                p_loo,
+                *difference,
+                shape,
+                n_unreliable,
+            )
+        )
     good = [s for s in scores if s.difference <= max(NEGLIGIBLE, STANDARD_ERRORS * s.difference_se)]
     return Comparison(tuple(scores), min(good, key=lambda s: s.n_parameters).name)
 
@@ -153,7 +179,9 @@ def _error_of_sum(values: Floats) -> float:
     return float(np.sqrt(values.size * np.var(values)))
 
 
-def _leave_one_out(posterior: Posterior, chain: Chain, n_draws: int) -> tuple[Floats, float, float, int]:
+def _leave_one_out(
+    posterior: Posterior, chain: Chain, n_draws: int
+) -> tuple[Floats, float, float, int]:
     """elpd of every pixel, the effective number of parameters, the largest Pareto shape and how many are too large."""
     every = chain.draws()
     draws = every[np.linspace(0, len(every) - 1, min(n_draws, len(every))).round().astype(int)]
@@ -177,8 +205,12 @@ def _leave_one_out(posterior: Posterior, chain: Chain, n_draws: int) -> tuple[Fl
     for part in np.array_split(wide, math.ceil(wide.size * len(draws) / BLOCK) or 1):
         values = np.stack([value[part] for value in _log_likelihoods(posterior, draws)], axis=-1)
         if part.size:
-            with np.errstate(all="ignore"):  # a tail of draws that are all alike has no shape: NaN, which is not reliable
-                elpd[part], shape[part], p = array_stats.loo(values, chain_axis=None, draw_axis=-1, r_eff=r_eff)
+            with np.errstate(
+                all="ignore"
+            ):  # a tail of draws that are all alike has no shape: NaN, which is not reliable
+                elpd[part], shape[part], p = array_stats.loo(
+                    values, chain_axis=None, draw_axis=-1, r_eff=r_eff
+                )
             seen[part] = elpd[part] + p
     limit = min(1.0 - 1.0 / math.log10(len(draws)), 0.7)
     return elpd, float(np.sum(seen - elpd)), float(shape.max()), int(np.sum(~(shape <= limit)))
@@ -190,4 +222,6 @@ def _log_likelihoods(posterior: Posterior, draws: Floats) -> Iterator[Floats]:
     counts = posterior.counts[used]
     constant = posterior.parameter_names.index("background")
     for draw in draws:
-        yield posterior.noise.log_likelihood(counts, posterior.expected_counts(draw)[used], draw[constant])
+        yield posterior.noise.log_likelihood(
+            counts, posterior.expected_counts(draw)[used], draw[constant]
+        )

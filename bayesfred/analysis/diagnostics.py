@@ -1,17 +1,20 @@
 """What a finished run is worth: did the chain converge, does the model fit the counts, and how much of it is the prior's.
 
-`diagnose` puts all into one record. Convergence is judged on R-hat, effective sample sizes, acceptance and
-the optimiser's own verdict (`bayesfred.inference.convergence` holds the estimators). The fit is judged at
-the MAP by three sums over the pixels that enter the likelihood: the paper's normalised chi-square,
-Pearson's statistic and the deviance. The last two come with the expectation and standard deviation they
-have when the model is true, see `bayesfred.inference.goodness`. What the prior does to the posterior is
-read off the draws, weighted as if prior or likelihood were raised to a power near 1.
+`diagnose` puts all into one record. Convergence is judged on R-hat, effective sample sizes,
+acceptance and the optimiser's own verdict (`bayesfred.sampling.convergence` holds the estimators).
+The fit is judged at the MAP by three sums over the pixels that enter the likelihood: the paper's
+normalised chi-square, Pearson's statistic and the deviance. The last two come with the expectation
+and standard deviation they have when the model is true, see `bayesfred.optimize.fit_statistics`.
+What the prior does to the posterior is read off the draws, weighted as if prior or likelihood were
+raised to a power near 1.
 
 References
 ----------
-N. Kallioinen, T. Paananen, P.-C. Buerkner, A. Vehtari (2024), Statistics and Computing 34, 57: power-scaling.
+N. Kallioinen, T. Paananen, P.-C. Buerkner, A. Vehtari (2024), Statistics and Computing 34, 57:
+power-scaling.
 R. Sun, S. Zhou, section on noise: the estimate of lambda and the normalised chi-square.
-A. Sokal (1996), Monte Carlo methods in statistical mechanics: the window of the autocorrelation time.
+A. Sokal (1996), Monte Carlo methods in statistical mechanics: the window of the autocorrelation
+time.
 """
 
 import warnings
@@ -22,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from bayesfred.inference.chainfile import Chain
-from bayesfred.inference.convergence import autocorrelation, convergence
-from bayesfred.inference.goodness import goodness
-from bayesfred.inference.posterior import Posterior
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.fit_statistics import fit_statistics
+from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.convergence import autocorrelation, convergence
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
 
@@ -51,8 +54,8 @@ class Diagnostics:
     ess_bulk, ess_tail : dict of str to float
         Effective numbers of draws for the centre and for the 5 % and 95 % quantiles, by parameter.
     tau : dict of str to float
-        Integrated autocorrelation time, in steps, by parameter; a lower bound where the chain is shorter
-        than 10 tau.
+        Integrated autocorrelation time, in steps, by parameter; a lower bound where the chain is
+        shorter than 10 tau.
     acceptance : float
         Mean fraction of accepted moves, burn-in included.
     n_draws : int
@@ -62,17 +65,19 @@ class Diagnostics:
     n_fitted : int
         Fitted numbers: parameters, and every source's flux and position where these are free.
     background_estimate : float
-        The paper's lambda-hat, counts per pixel: mean of counts less the source image. nan unless the
-        background is a constant.
+        The paper's lambda-hat, counts per pixel: mean of counts less the source image. nan unless
+        the background is a constant.
     chi2_paper : float
-        The paper's normalised chi-square, about 1 where the sources add no noise of their own. nan as above.
+        The paper's normalised chi-square, about 1 where the sources add no noise of their own. nan
+        as above.
     pearson, pearson_expected, pearson_sd : float
         Sum of (n - mu)^2 / variance, and what a true model, fitted, would give.
     deviance, deviance_expected, deviance_sd : float
         Sum of 2 (n log(n / mu) - n + mu), likewise.
     prior_sensitivity, likelihood_sensitivity : dict of str to float
-        How far each parameter's posterior moves when the prior, or the likelihood, is raised to a power alpha: cumulative
-        Jensen-Shannon distance per unit of log2(alpha) at alpha = 1. nan where draws are too few or do not vary.
+        How far each parameter's posterior moves when the prior, or the likelihood, is raised to a
+        power alpha: cumulative Jensen-Shannon distance per unit of log2(alpha) at alpha = 1. nan
+        where draws are too few or do not vary.
     prior_dominated : tuple of str
         Parameters whose prior sensitivity is at least 0.05: not the frame alone decides about them.
     """
@@ -119,8 +124,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
 
     References
     ----------
-    Sun and Zhou, the equations of lambda-hat and of the normalised chi-square, for `background_estimate` and
-    `chi2_paper`. Kallioinen et al. (2024) for the sensitivities.
+    Sun and Zhou, the equations of lambda-hat and of the normalised chi-square, for
+    `background_estimate` and `chi2_paper`. Kallioinen et al. (2024) for the sensitivities.
     """
     posterior = chain.posterior()
     names = chain.parameter_names
@@ -144,17 +149,19 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         n_draws=n_ensembles * n_steps * n_walkers,
         prior_sensitivity=_by_name(names, prior),
         likelihood_sensitivity=_by_name(names, likelihood),
-        prior_dominated=tuple(name for name, value in zip(names, prior, strict=True) if value >= INFORMATIVE),
-        **goodness(posterior, chain.estimate.params),
+        prior_dominated=tuple(
+            name for name, value in zip(names, prior, strict=True) if value >= INFORMATIVE
+        ),
+        **fit_statistics(posterior, chain.estimate.params),
     )
 
 
 def autocorrelation_time(series: NDArray[np.float64], window: float = 5.0) -> float:
     """Integrated autocorrelation time by Sokal's window.
 
-    1 + 2 sum rho_t up to the first lag M >= window tau(M), with the autocorrelation pooled over chains
-    about their common mean. For long chains this is what `emcee.autocorr.integrated_time` estimates; for
-    short ones it lacks the bias of subtracting each walker's own mean.
+    1 + 2 sum rho_t up to the first lag M >= window tau(M), with the autocorrelation pooled over
+    chains about their common mean. For long chains this is what `emcee.autocorr.integrated_time`
+    estimates; for short ones it lacks the bias of subtracting each walker's own mean.
 
     Parameters
     ----------
@@ -175,18 +182,26 @@ def autocorrelation_time(series: NDArray[np.float64], window: float = 5.0) -> fl
     return float(tau[closed[0] if closed.size else -1])
 
 
-def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sensitivities(
+    chain: Chain, posterior: Posterior
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
     names = chain.parameter_names
-    draws = chain.chain[:, chain.burn_in :].swapaxes(1, 2).reshape(-1, len(names))  # walker by walker
+    draws = (
+        chain.chain[:, chain.burn_in :].swapaxes(1, 2).reshape(-1, len(names))
+    )  # walker by walker
     log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
     log_prior = posterior.log_prior(draws)
     return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
 
 
-def _sensitivity(names: tuple[str, ...], draws: NDArray[np.float64], log_part: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sensitivity(
+    names: tuple[str, ...], draws: NDArray[np.float64], log_part: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Sensitivity of every parameter to that factor of the posterior whose logarithm at the draws is given, shape (d,)."""
-    from arviz_stats import psense  # takes long to load, and most of what imports this module judges no chain
+    from arviz_stats import (
+        psense,
+    )  # takes long to load, and most of what imports this module judges no chain
 
     if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
         return np.full(len(names), np.nan)
@@ -194,7 +209,11 @@ def _sensitivity(names: tuple[str, ...], draws: NDArray[np.float64], log_part: N
         return np.zeros(len(names))
     posterior = {name: draws[None, :, k] for k, name in enumerate(names)}
     data = arviz_base.from_dict({"posterior": posterior, "log_prior": {"part": log_part[None]}})
-    with warnings.catch_warnings(), np.errstate(invalid="ignore"), threadpool_limits(1, user_api="blas"):
+    with (
+        warnings.catch_warnings(),
+        np.errstate(invalid="ignore"),
+        threadpool_limits(1, user_api="blas"),
+    ):
         warnings.filterwarnings("ignore", message="Number of tail draws")
         try:
             sensitivity = psense(data)
@@ -208,7 +227,11 @@ def _by_name(names: tuple[str, ...], values: NDArray[np.float64]) -> dict[str, f
 
 
 def _verdict(
-    rhat: NDArray[np.float64], ess: NDArray[np.float64], acceptance: float, chain: Chain, target_ess: float
+    rhat: NDArray[np.float64],
+    ess: NDArray[np.float64],
+    acceptance: float,
+    chain: Chain,
+    target_ess: float,
 ) -> tuple[bool, str]:
     """Whether all criteria are met, and the line that says which are not."""
     names = chain.parameter_names
@@ -217,7 +240,9 @@ def _verdict(
     if not rhat[worst] <= MAX_RHAT:
         failures.append(f"R-hat {rhat[worst]:.3f} of {names[worst]} exceeds {MAX_RHAT}")
     if not ess[least] >= target_ess:
-        failures.append(f"effective sample size {ess[least]:.0f} of {names[least]} is below {target_ess:.0f}")
+        failures.append(
+            f"effective sample size {ess[least]:.0f} of {names[least]} is below {target_ess:.0f}"
+        )
     if not acceptance >= MIN_ACCEPTANCE:
         failures.append(f"acceptance {acceptance:.1%} is below {MIN_ACCEPTANCE:.0%}")
     if not chain.estimate.at_maximum:
@@ -225,5 +250,6 @@ def _verdict(
     if failures:
         return False, "not converged: " + "; ".join(failures)
     return True, (
-        f"converged: R-hat at most {rhat[worst]:.4f}, effective sample size at least {ess[least]:.0f}, acceptance {acceptance:.1%}"
+        f"converged: R-hat at most {rhat[worst]:.4f}, effective sample size at least "
+        f"{ess[least]:.0f}, acceptance {acceptance:.1%}"
     )

@@ -1,11 +1,13 @@
 """Whether error bars hold: truths drawn from the prior, and where they lie among the draws of their frames' posteriors.
 
-Only for the exact posterior is the truth like one more draw, so that any error of model, optimiser or sampler shows in the ranks.
+Only for the exact posterior is the truth like one more draw, so that any error of model, optimiser
+or sampler shows in the ranks.
 
 References
 ----------
-S. Talts, M. Betancourt, D. Simpson, A. Vehtari, A. Gelman (2018), arXiv:1804.06788. M. Modrak et al. (2023), Bayesian Analysis
-20, 461 (quantities that depend on the data, such as the log-likelihood).
+S. Talts, M. Betancourt, D. Simpson, A. Vehtari, A. Gelman (2018), arXiv:1804.06788. M. Modrak et
+al. (2023), Bayesian Analysis 20, 461 (quantities that depend on the data, such as the
+log-likelihood).
 """
 
 import math
@@ -20,12 +22,22 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erfc
 
-from bayesfred.analysis.refit import LEVELS, Method, check, coverage_error, covered, draws, given, maximum, seeds
-from bayesfred.analysis.tasks import Executor, run
-from bayesfred.analysis.uniformity import uniformity
+from bayesfred.analysis.ecdf_bands import uniformity
+from bayesfred.analysis.executor import Executor, run
+from bayesfred.analysis.study_helpers import (
+    LEVELS,
+    Method,
+    check,
+    coverage_error,
+    covered,
+    draws,
+    given,
+    maximum,
+    seeds,
+)
 from bayesfred.errors import InputError
-from bayesfred.inference.chainfile import fingerprint
-from bayesfred.inference.posterior import Posterior
+from bayesfred.model.posterior import Posterior
+from bayesfred.sampling.chainfile import fingerprint
 
 Floats = npt.NDArray[np.float64]
 
@@ -59,21 +71,36 @@ class _Calibration:
     def _field(self) -> dict[str, Floats]:
         """f and g at points of the field, as far as they depend on theta: they are linear in it, with these factors."""
         distortion = self.posterior.model.distortion
-        places = np.rint(0.5 * np.array(self.posterior.model.detector.fine_shape[::-1]) * FIELD_POINTS)
+        places = np.rint(
+            0.5 * np.array(self.posterior.model.detector.fine_shape[::-1]) * FIELD_POINTS
+        )
         field: dict[str, Floats] = {}
         for u, v in places:
-            both = np.array([distortion.displacement(unit, u, v, u, v) for unit in np.eye(distortion.n_terms)]).T
-            field |= {f"{letter}({u:+.0f}, {v:+.0f})": factors for letter, factors in zip("fg", both, strict=True) if factors.any()}
+            both = np.array(
+                [distortion.displacement(unit, u, v, u, v) for unit in np.eye(distortion.n_terms)]
+            ).T
+            field |= {
+                f"{letter}({u:+.0f}, {v:+.0f})": factors
+                for letter, factors in zip("fg", both, strict=True)
+                if factors.any()
+            }
         return field
 
     @property
     def columns(self) -> tuple[str, ...]:
-        each = (f"{name}.{what}" for name in self.quantities for what in ("truth", "mean", "sd", "pit"))
+        each = (
+            f"{name}.{what}" for name in self.quantities for what in ("truth", "mean", "sd", "pit")
+        )
         return ("draws", *each)
 
     def contents(self) -> dict[str, str]:
         fitted = {f"fitted {name}": value for name, value in fingerprint(self.fitted).items()}
-        return {**fingerprint(self.posterior), **fitted, "method": self.method, "seed": str(self.seed)}
+        return {
+            **fingerprint(self.posterior),
+            **fitted,
+            "method": self.method,
+            "seed": str(self.seed),
+        }
 
     def task(self, k: int) -> Sequence[float]:
         for_truth, for_draws, for_ranks = seeds(self.seed, k).spawn(3)
@@ -94,17 +121,24 @@ class _Calibration:
     def truth(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Parameters from the prior and a frame of theirs, drawn again where a map folds, as these have no prior probability."""
         for _ in range(REDRAWS):
-            truth = np.array([prior.rvs(random_state=rng) for prior in self.posterior.prior.values()])
+            truth = np.array(
+                [prior.rvs(random_state=rng) for prior in self.posterior.prior.values()]
+            )
             counts = self.posterior.simulate(truth, rng)
             if counts is not None:
                 return truth, counts
-        raise InputError(f"prior: got {REDRAWS} draws that all fold a source's image, expected some that do not: narrow it")
+        raise InputError(
+            f"prior: got {REDRAWS} draws that all fold a source's image, expected some that do "
+            "not: narrow it"
+        )
 
     def _judged(self, posterior: Posterior, params: Floats) -> Floats:
         """The quantities that are ranked, shape (n, number)."""
         likelihood = posterior.log_prob(params) - posterior.log_prior(params)
         theta = params[:, : self.posterior.model.distortion.n_terms]
-        return np.stack([*params.T, likelihood, *(theta @ factors for factors in self._field.values())], axis=1)
+        return np.stack(
+            [*params.T, likelihood, *(theta @ factors for factors in self._field.values())], axis=1
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +158,8 @@ class PosteriorCalibration:
     n_failed : int
         Frames that have none.
     pit : dict of str to ndarray, shape (n,)
-        Randomised ranks of the truths, between 0 and 1, by quantity: every parameter, the log-likelihood, and f and g at
-        field points (pixel).
+        Randomised ranks of the truths, between 0 and 1, by quantity: every parameter, the
+        log-likelihood, and f and g at field points (pixel).
     quantities : dict of str to ndarray
         A row for each of them: see `calibrate_posterior`.
     """
@@ -155,22 +189,27 @@ def calibrate_posterior(
 ) -> PosteriorCalibration:
     """Simulation-based calibration: truths from the prior, ranked among the draws of their frames' posteriors.
 
-    Of each frame at least 200 draws an autocorrelation time apart are kept. With randomised ranks, the share of draws below the
-    truth is exactly uniform if and only if truth and draws come from one distribution.
+    Of each frame at least 200 draws an autocorrelation time apart are kept. With randomised ranks,
+    the share of draws below the truth is exactly uniform if and only if truth and draws come from
+    one distribution.
 
-    Every row of `PosteriorCalibration.quantities` has the quantity's name; uniformity, the p-value of its ranks' whole distribution
-    function; coverage_68 and coverage_95, the shares of central intervals that hold the truth, with their binomial errors; bias,
-    the mean of (posterior mean - truth) with its error; pull, the mean of that difference over the posterior's sd, and pull_error,
-    1/sqrt(n). The verdict takes all p-values together, those of coverage and of pull too: posteriors that are exact are refused in
-    at most one study of 100 (Bonferroni), and so is a study in which over 1 % of the frames have no posterior.
+    Every row of `PosteriorCalibration.quantities` has the quantity's name; uniformity, the p-value
+    of its ranks' whole distribution function; coverage_68 and coverage_95, the shares of central
+    intervals that hold the truth, with their binomial errors; bias, the mean of (posterior mean -
+    truth) with its error; pull, the mean of that difference over the posterior's sd, and
+    pull_error, 1/sqrt(n). The verdict takes all p-values together, those of coverage and of pull
+    too: posteriors that are exact are refused in at most one study of 100 (Bonferroni), and so is a
+    study in which over 1 % of the frames have no posterior.
 
     Parameters
     ----------
     posterior : Posterior
-        Of any frame: the model, priors, noise, mask and nuisances are used, the counts are not. Every prior has to be proper, and
-        all are here; the default ones are broad, so that a study may rather be of narrower ones.
+        Of any frame: the model, priors, noise, mask and nuisances are used, the counts are not.
+        Every prior has to be proper, and all are here; the default ones are broad, so that a study
+        may rather be of narrower ones.
     fitted : Posterior, optional
-        What is fitted, if it is another than what frames are drawn from: to see what a wrong model does to the error bars.
+        What is fitted, if it is another than what frames are drawn from: to see what a wrong model
+        does to the error bars.
     replicates : int
         Frames to simulate.
     method : {"mcmc", "laplace"}
@@ -185,13 +224,15 @@ def calibrate_posterior(
     Raises
     ------
     InputError
-        If the posteriors differ in parameters, the file exists or holds another study, or a worker dies.
+        If the posteriors differ in parameters, the file exists or holds another study, or a worker
+        dies.
     KeyboardInterrupt
         After every finished frame was kept.
 
     References
     ----------
-    S. Talts et al. (2018), arXiv:1804.06788. T. Saeilynoja, P.-C. Buerkner, A. Vehtari (2022), Statistics and Computing 32, 32.
+    S. Talts et al. (2018), arXiv:1804.06788. T. Saeilynoja, P.-C. Buerkner, A. Vehtari (2022),
+    Statistics and Computing 32, 32.
 
     Examples
     --------
@@ -210,7 +251,8 @@ def calibrate_posterior(
     judged = fitted or posterior
     if judged.parameter_names != posterior.parameter_names:
         raise InputError(
-            f"calibration: fitted: got the parameters {', '.join(judged.parameter_names)}, expected those of the posterior: "
+            f"calibration: fitted: got the parameters {', '.join(judged.parameter_names)}, "
+            "expected those of the posterior: "
             f"{', '.join(posterior.parameter_names)}"
         )
     return _calibrate(
@@ -229,12 +271,16 @@ def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCal
     if n < 2:
         reason = rows["message"][~good][0]
         message = f"not calibrated: no posterior of {n_failed} frames ({reason})"
-        return PosteriorCalibration(path, False, message, n, n_failed, {}, {"quantity": np.empty(0, "U1")})
+        return PosteriorCalibration(
+            path, False, message, n, n_failed, {}, {"quantity": np.empty(0, "U1")}
+        )
     table: list[dict[str, Any]] = []
     pits: dict[str, Floats] = {}
     checks: list[tuple[float, str]] = []
     for name in study.quantities:
-        truth, mean, sd, pit = (rows[f"{name}.{what}"][good] for what in ("truth", "mean", "sd", "pit"))
+        truth, mean, sd, pit = (
+            rows[f"{name}.{what}"][good] for what in ("truth", "mean", "sd", "pit")
+        )
         pits[name] = pit
         pull, off = (mean - truth) / sd, mean - truth
         row: dict[str, Any] = {"quantity": name, "uniformity": uniformity(pit)}
@@ -243,20 +289,30 @@ def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCal
             key, share = f"coverage_{100 * level:.0f}", float(covered(pit, level).mean())
             row |= {key: share, f"{key}_error": coverage_error(level, n)}
             checks.append(
-                (_chance((share - level) / coverage_error(level, n)), f"{level:.0%} intervals of {name} hold {share:.1%}")
+                (
+                    _chance((share - level) / coverage_error(level, n)),
+                    f"{level:.0%} intervals of {name} hold {share:.1%}",
+                )
             )
         row |= {"bias": float(off.mean()), "bias_error": float(off.std(ddof=1)) / math.sqrt(n)}
         row |= {"pull": float(pull.mean()), "pull_error": 1.0 / math.sqrt(n)}
         if name != "log_likelihood":  # whose posterior is not symmetric
-            checks.append((_chance(row["pull"] * math.sqrt(n)), f"mean pull of {name} is {row['pull']:+.3f}"))
+            checks.append(
+                (_chance(row["pull"] * math.sqrt(n)), f"mean pull of {name} is {row['pull']:+.3f}")
+            )
         table.append(row)
     failures = [(p, text) for p, text in sorted(checks) if p * len(checks) < FALSE_ALARM]
-    reasons = [f"{text} (p = {p:.1g})" for p, text in failures[:3]] + (["..."] if len(failures) > 3 else [])
+    reasons = [f"{text} (p = {p:.1g})" for p, text in failures[:3]] + (
+        ["..."] if len(failures) > 3 else []
+    )
     if n_failed > MOST_FAILED * (n + n_failed):
-        reasons.append(f"{n_failed} of {n + n_failed} frames have no posterior ({rows['message'][~good][0]})")
+        reasons.append(
+            f"{n_failed} of {n + n_failed} frames have no posterior ({rows['message'][~good][0]})"
+        )
     least = min(checks)[0] * len(checks)
     message = "not calibrated: " + "; ".join(reasons) if reasons else (
-        f"calibrated: {n} frames, {len(pits)} quantities, {len(checks)} checks of which the least likely has a chance of "
+        f"calibrated: {n} frames, {len(pits)} quantities, {len(checks)} checks of which the least "
+        "likely has a chance of "
         f"{min(least, 1.0):.2g} among as many"
     )  # fmt: skip
     columns = {key: np.array([row[key] for row in table]) for key in table[0]}

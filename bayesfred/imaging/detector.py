@@ -1,11 +1,11 @@
 """The image sensor: which points of the image plane make up a recorded pixel, and the sampling correction.
 
-Two pixel responses. `impulse` samples the image at the centre of every fine pixel, which is what the paper
-assumes of a frame that it has corrected; `box` integrates over the pixel, which is what a sensor does.
-Binning B adds B x B fine pixels to one recorded pixel. Either way a recorded pixel is a weighted sum over a
-small grid of points, `Detector.quadrature` along each axis, so `forward` knows no cases. `sampling_matrix`
-and `correct_sampling` are the paper's way from a recorded frame back to an impulse-sampled one; they
-correlate the noise, so inference on counts uses `box` instead.
+Two pixel responses. `impulse` samples the image at the centre of every fine pixel, which is what
+the paper assumes of a frame that it has corrected; `box` integrates over the pixel, which is what a
+sensor does. Binning B adds B x B fine pixels to one recorded pixel. Either way a recorded pixel is
+a weighted sum over a small grid of points, `Detector.quadrature` along each axis, so `forward`
+knows no cases. `sampling_matrix` and `correct_sampling` are the paper's way from a recorded frame
+back to an impulse-sampled one; they correlate the noise, so inference on counts uses `box` instead.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 
 PIXELS = ("impulse", "box")
 
-# Bound on the box rule's error along one axis. Up to pixels of 12 sigma the two axes together stay below 6e-7
-# of the peak, even where the distortion narrows a spot 1.3 times: see `_box_order`.
+# Bound on the box rule's error along one axis. Up to pixels of 12 sigma the two axes together stay
+# below 6e-7 of the peak, even where the distortion narrows a spot 1.3 times: see `_box_order`.
 BOX_TOLERANCE = 2e-8
 
 # Points along a pixel's side beyond which nobody waits for the sum over their square.
@@ -50,8 +50,8 @@ class Detector:
     Raises
     ------
     InputError
-        If `shape` is not two integers >= 1, `binning` is not an integer >= 1, or `pixel` is not one of the
-        two.
+        If `shape` is not two integers >= 1, `binning` is not an integer >= 1, or `pixel` is not one
+        of the two.
 
     References
     ----------
@@ -77,7 +77,9 @@ class Detector:
         if not isinstance(self.binning, int | np.integer) or self.binning < 1:
             raise InputError(f"binning: got {self.binning!r}, expected an integer of at least 1")
         if self.pixel not in PIXELS:
-            raise InputError(f"pixel: got {self.pixel!r}, expected one of {', '.join(map(repr, PIXELS))}")
+            raise InputError(
+                f"pixel: got {self.pixel!r}, expected one of {', '.join(map(repr, PIXELS))}"
+            )
         object.__setattr__(self, "shape", (ny, nx))
         object.__setattr__(self, "binning", int(self.binning))
 
@@ -110,8 +112,8 @@ class Detector:
         Parameters
         ----------
         sigma : float, fine pixel
-            Width (Gaussian standard deviation) of the narrowest structure that the PSF has; `box` chooses the
-            number of points by it.
+            Width (Gaussian standard deviation) of the narrowest structure that the PSF has; `box`
+            chooses the number of points by it.
         beta : float
             Exponent of a Moffat function, if it is one whose peak is curved like this Gaussian's.
 
@@ -125,7 +127,8 @@ class Detector:
         Raises
         ------
         InputError
-            If `sigma` is not a finite number > 0, or so small that a pixel would take more than `MOST_POINTS` points a side.
+            If `sigma` is not a finite number > 0, or so small that a pixel would take more than
+            `MOST_POINTS` points a side.
 
         Examples
         --------
@@ -139,7 +142,9 @@ class Detector:
             return _centred(self.binning), np.ones(self.binning)
         nodes, weights = np.polynomial.legendre.leggauss(_box_order(self.binning / sigma, beta))
         half = self.binning / 2.0
-        return np.asarray(nodes * half, dtype=np.float64), np.asarray(weights * half, dtype=np.float64)
+        return np.asarray(nodes * half, dtype=np.float64), np.asarray(
+            weights * half, dtype=np.float64
+        )
 
     def write(self, group: Any) -> None:
         """Store the detector in an HDF5 group: attributes `shape`, `binning` and `pixel`."""
@@ -162,15 +167,17 @@ def _centred(n: int) -> FloatArray:
 def _box_order(width: float, beta: float) -> int:
     """Smallest Gauss-Legendre order q that integrates a Gaussian, or a Moffat, over `width` sigma to BOX_TOLERANCE.
 
-    Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some point of it.
-    The even derivatives of F = exp(-x^2 / 2 s^2) are largest at x = 0 (its Fourier transform is positive),
-    where they are (2q-1)!! / s^(2q) with (2q-1)!! = (2q)! / (2^q q!). So, per unit of h, it is at most
+    Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some
+    point of it. The even derivatives of F = exp(-x^2 / 2 s^2) are largest at x = 0 (its Fourier
+    transform is positive), where they are (2q-1)!! / s^(2q) with (2q-1)!! = (2q)! / (2^q q!). So,
+    per unit of h, it is at most
 
         e_q = (h/s)^(2q) (q!)^3 / ((2q+1) ((2q)!)^2 2^q),   e_0 = 1,
         e_q / e_(q-1) = (h/s)^2 q / (8 (4q^2 - 1)).
 
-    Those of a Moffat, F = (1 + x^2 / 2 beta s^2)^-beta, are largest there for the same reason: (2q)! / q! times
-    beta (beta + 1) ... (beta + q - 1) / (2 beta s^2)^q. So every step of e_q has a factor 1 + (q - 1) / beta.
+    Those of a Moffat, F = (1 + x^2 / 2 beta s^2)^-beta, are largest there for the same reason:
+    (2q)! / q! times beta (beta + 1) ... (beta + q - 1) / (2 beta s^2)^q. So every step of e_q has a
+    factor 1 + (q - 1) / beta.
 
     Distortion that narrows a spot by a factor c multiplies e_q by c^(2q).
     """
@@ -179,7 +186,8 @@ def _box_order(width: float, beta: float) -> int:
         order += 1
         if order > MOST_POINTS:
             raise InputError(
-                f"psf: sigma: got pixels of {width:.3g} sigma with pixel = 'box', expected few enough to integrate over with "
+                f"psf: sigma: got pixels of {width:.3g} sigma with pixel = 'box', expected few "
+                "enough to integrate over with "
                 f"{MOST_POINTS} points a side: widen the PSF or bin less"
             )
         bound *= width * width * order * (1.0 + (order - 1) / beta) / (8.0 * (4 * order**2 - 1))
@@ -189,13 +197,15 @@ def _box_order(width: float, beta: float) -> int:
 def sampling_matrix(n: int) -> FloatArray:
     """Build the paper's matrix R: what integration over pixels makes of impulse samples along one axis.
 
-    A band-limited image is the sum over m of I_m sinc(u - m) (Whittaker-Shannon; sinc t is sin(pi t) / pi t).
-    Its integral over pixel i is the sum of R_im I_m with
+    A band-limited image is the sum over m of I_m sinc(u - m) (Whittaker-Shannon; sinc t is sin(pi
+    t) / pi t). Its integral over pixel i is the sum of R_im I_m with
 
-        R_im = int_{i-1/2}^{i+1/2} sinc(u - m) du = [Si(pi (k + 1/2)) - Si(pi (k - 1/2))] / pi,   k = i - m,
+        R_im = int_{i-1/2}^{i+1/2} sinc(u - m) du = [Si(pi (k + 1/2)) - Si(pi (k - 1/2))] / pi,   k
+        = i - m,
 
-    Si the sine integral. R depends on |i - m| alone: a symmetric Toeplitz matrix. On a frame it acts along
-    both axes, R I R. The sum over m runs over the frame only, so the image has to vanish at its border.
+    Si the sine integral. R depends on |i - m| alone: a symmetric Toeplitz matrix. On a frame it
+    acts along both axes, R I R. The sum over m runs over the frame only, so the image has to vanish
+    at its border.
 
     Parameters
     ----------
@@ -228,8 +238,9 @@ def sampling_matrix(n: int) -> FloatArray:
 def correct_sampling(frame: ArrayLike) -> FloatArray:
     """Turn a frame of pixel integrals into impulse samples at the pixels' centres: R^-1 I R^-1.
 
-    R is `sampling_matrix` of each axis' length; a Toeplitz solver stands for the inverse. The correction
-    correlates the noise of neighbouring pixels: fit raw counts with `Detector(pixel="box")` instead.
+    R is `sampling_matrix` of each axis' length; a Toeplitz solver stands for the inverse. The
+    correction correlates the noise of neighbouring pixels: fit raw counts with
+    `Detector(pixel="box")` instead.
 
     Parameters
     ----------
@@ -254,10 +265,14 @@ def correct_sampling(frame: ArrayLike) -> FloatArray:
         raise InputError(f"frame: got shape {values.shape}, expected two dimensions (ny, nx)")
     if not np.isfinite(values).all():
         bad = values.size - int(np.isfinite(values).sum())
-        raise InputError(f"frame: got {bad} pixels that are not finite, expected none: fill them first")
+        raise InputError(
+            f"frame: got {bad} pixels that are not finite, expected none: fill them first"
+        )
     ny, nx = values.shape
     rows_solved = solve_toeplitz(_sampling_column(ny), values)
-    return np.ascontiguousarray(solve_toeplitz(_sampling_column(nx), rows_solved.T).T, dtype=np.float64)
+    return np.ascontiguousarray(
+        solve_toeplitz(_sampling_column(nx), rows_solved.T).T, dtype=np.float64
+    )
 
 
 def _sampling_column(n: int) -> FloatArray:

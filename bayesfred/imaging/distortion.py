@@ -1,13 +1,14 @@
 """Polynomial field distortion: the displacement (f, g) of a point between the object and the image plane.
 
-A point source at (x, y) of the object plane reaches the image point (u, v) with the reference PSF at
+A point source at (x, y) of the object plane reaches the image point (u, v) with the reference PSF
+at
 
     a = u - x + f(u, v, x, y),   b = v - y + g(u, v, x, y),
 
 so its image stands where a = b = 0. f and g are sums of monomials theta_k x^i y^j u^m v^n; the
-distortion-free condition (a source on the axis is not distorted) asks i + j >= 1 of every one of them. The
-pinhole camera with polynomial distortion is the special case m = n = 0. What is here serves positions and
-maps; the images themselves come from `forward`.
+distortion-free condition (a source on the axis is not distorted) asks i + j >= 1 of every one of
+them. The pinhole camera with polynomial distortion is the special case m = n = 0. What is here
+serves positions and maps; the images themselves come from `forward`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ Exponents = tuple[int, int, int, int]
 
 X, Y, U, V = range(4)  # a variable's place in an exponent tuple (i, j, m, n)
 
-# Newton's method stops when a step is this small, relative to the point's coordinates (at least one pixel).
+# Newton's method stops when a step is this small, relative to the point's coordinates (at least one
+# pixel).
 RELATIVE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
 
@@ -49,18 +51,20 @@ _PINHOLE_G = ((1, 1, 0, 0), (0, 2, 0, 0), (2, 1, 0, 0), (0, 3, 0, 0))
 class PolynomialDistortion:
     """The terms of f and g; their coefficients theta are an argument of every method.
 
-    theta holds the coefficients of f's terms and then those of g's, in the terms' order. The unit of a
-    coefficient is pixel^(1 - i - j - m - n), written pixel^(1 - degree) below.
+    theta holds the coefficients of f's terms and then those of g's, in the terms' order. The unit
+    of a coefficient is pixel^(1 - i - j - m - n), written pixel^(1 - degree) below.
 
     Attributes
     ----------
     f_terms, g_terms : tuple of (i, j, m, n)
-        Powers of x, y, u and v of each term; any sequences of integers will do. One of the two may be empty.
+        Powers of x, y, u and v of each term; any sequences of integers will do. One of the two may
+        be empty.
 
     Raises
     ------
     InputError
-        If a term is not four integers >= 0, has i + j < 1, or stands twice in f or in g; if there is none.
+        If a term is not four integers >= 0, has i + j < 1, or stands twice in f or in g; if there
+        is none.
 
     References
     ----------
@@ -107,9 +111,9 @@ class PolynomialDistortion:
     def pinhole(cls) -> Self:
         """Take the 8 terms of the pinhole camera that the paper compares with.
 
-        x_d = x (1 + k1 x + k2 y + k3 x^2 + k4 y^2) is the place u where u - x + f vanishes for
-        f = -(k1 x^2 + k2 xy + k3 x^3 + k4 x y^2), and y_d = y (1 + k5 x + k6 y + k7 x^2 + k8 y^2) likewise:
-        theta = -(k1, ..., k8).
+        x_d = x (1 + k1 x + k2 y + k3 x^2 + k4 y^2) is the place u where u - x + f vanishes for f =
+        -(k1 x^2 + k2 xy + k3 x^3 + k4 x y^2), and y_d = y (1 + k5 x + k6 y + k7 x^2 + k8 y^2)
+        likewise: theta = -(k1, ..., k8).
 
         Examples
         --------
@@ -119,10 +123,11 @@ class PolynomialDistortion:
         return cls(_PINHOLE_F, _PINHOLE_G)
 
     @classmethod
-    def complete(cls, degree: int) -> Self:
+    def full_polynomial(cls, degree: int) -> Self:
         """Take every term of total degree i + j + m + n from 2 to `degree` with i + j >= 1, in f and in g.
 
-        They are ordered by total degree and, within one degree, by falling power of u, then of v, then of x.
+        They are ordered by total degree and, within one degree, by falling power of u, then of v,
+        then of x.
 
         Parameters
         ----------
@@ -136,7 +141,7 @@ class PolynomialDistortion:
 
         Examples
         --------
-        >>> PolynomialDistortion.complete(2).names[:7]
+        >>> PolynomialDistortion.full_polynomial(2).names[:7]
         ('f_ux', 'f_uy', 'f_vx', 'f_vy', 'f_x2', 'f_xy', 'f_y2')
         """
         if not isinstance(degree, int | np.integer) or degree < 2:
@@ -188,11 +193,13 @@ class PolynomialDistortion:
         point = _point(u, v, x, y)
         return _polynomial(f_theta, self.f_terms, point), _polynomial(g_theta, self.g_terms, point)
 
-    def determinant(self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
+    def determinant(
+        self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
+    ) -> FloatArray:
         """Jacobian determinant D = (1 + f_u)(1 + g_v) - f_v g_u of (a, b) with respect to (u, v).
 
-        |D| is the factor that makes the kernel integrate to one over (u, v); where D changes sign the image
-        folds. Arguments and errors are those of `displacement`.
+        |D| is the factor that makes the kernel integrate to one over (u, v); where D changes sign
+        the image folds. Arguments and errors are those of `displacement`.
 
         Returns
         -------
@@ -204,7 +211,9 @@ class PolynomialDistortion:
         g_u, g_v = (_polynomial(g_theta, self.g_terms, point, along) for along in (U, V))
         return np.asarray((1.0 + f_u) * (1.0 + g_v) - f_v * g_u)
 
-    def image_position(self, theta: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def image_position(
+        self, theta: ArrayLike, x: ArrayLike, y: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
         """Where the image of an object point stands: the (u, v) with u - x + f = 0 and v - y + g = 0.
 
         Newton's method with the analytic derivatives, from (u, v) = (x, y).
@@ -248,7 +257,9 @@ class PolynomialDistortion:
 
         return _newton(residual, x, y)
 
-    def object_position(self, theta: ArrayLike, u: ArrayLike, v: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def object_position(
+        self, theta: ArrayLike, u: ArrayLike, v: ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
         """Which object point is imaged at (u, v): the inverse of `image_position`, solved the same way.
 
         Parameters
@@ -299,7 +310,8 @@ class PolynomialDistortion:
         values = np.asarray(theta, dtype=float)
         if values.shape != (self.n_terms,):
             raise InputError(
-                f"theta: got shape {values.shape}, expected ({self.n_terms},): one value each for {', '.join(self.names)}"
+                f"theta: got shape {values.shape}, expected ({self.n_terms},): one value each for "
+                f"{', '.join(self.names)}"
             )
         return values[: len(self.f_terms)], values[len(self.f_terms) :]
 
@@ -312,7 +324,8 @@ def _checked_terms(letter: str, terms: Sequence[Sequence[int]]) -> tuple[Exponen
             i, j, m, n = (operator.index(power) for power in term)
         except (TypeError, ValueError):
             raise InputError(
-                f"{letter}_terms: got {term!r}, expected four integers (i, j, m, n): the powers of x, y, u, v"
+                f"{letter}_terms: got {term!r}, expected four integers (i, j, m, n): the powers "
+                "of x, y, u, v"
             ) from None
         powers = (i, j, m, n)
         if min(powers) < 0:
@@ -320,7 +333,8 @@ def _checked_terms(letter: str, terms: Sequence[Sequence[int]]) -> tuple[Exponen
         named = f"{letter}_terms: got {_term_name(letter, powers)} {powers}"
         if i + j < 1:
             raise InputError(
-                f"{named}, which breaks the distortion-free condition at the axis; expected i + j >= 1: "
+                f"{named}, which breaks the distortion-free condition at the axis; expected i + j "
+                ">= 1: "
                 "give the term a power of x or y, or leave it out"
             )
         if powers in checked:
@@ -340,7 +354,9 @@ def _complete_terms(degree: int) -> Iterator[Exponents]:
 
 def _term_name(letter: str, term: Sequence[int]) -> str:
     powers = [(symbol, term[place]) for symbol, place in (("u", U), ("v", V), ("x", X), ("y", Y))]
-    written = [symbol if power == 1 else f"{symbol}{power}" for symbol, power in powers if power > 0]
+    written = [
+        symbol if power == 1 else f"{symbol}{power}" for symbol, power in powers if power > 0
+    ]
     return f"{letter}_{''.join(written) or '1'}"
 
 
@@ -350,7 +366,10 @@ def _point(u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Floa
 
 
 def _polynomial(
-    theta: FloatArray, terms: Sequence[Sequence[int]], point: tuple[FloatArray, ...], along: int | None = None
+    theta: FloatArray,
+    terms: Sequence[Sequence[int]],
+    point: tuple[FloatArray, ...],
+    along: int | None = None,
 ) -> FloatArray:
     """Sum theta x^i y^j u^m v^n over the terms, or its derivative along one of the four variables."""
     total = np.zeros(point[0].shape)
@@ -370,12 +389,15 @@ def _polynomial(
 
 
 def _newton(
-    residual: Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]], p: FloatArray, q: FloatArray
+    residual: Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]],
+    p: FloatArray,
+    q: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Solve two equations at every point, from (p, q).
 
-    `residual` gives (r, s, r_p, r_q, s_p, s_q); a step is Cramer's rule on [[r_p, r_q], [s_p, s_q]]. A point
-    is done with the first step below the tolerance and is then left alone: the next would be rounding.
+    `residual` gives (r, s, r_p, r_q, s_p, s_q); a step is Cramer's rule on [[r_p, r_q], [s_p,
+    s_q]]. A point is done with the first step below the tolerance and is then left alone: the next
+    would be rounding.
     """
     scale = np.maximum(np.maximum(np.abs(p), np.abs(q)), 1.0)
     p, q = p.copy(), q.copy()

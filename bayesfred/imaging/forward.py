@@ -1,10 +1,11 @@
 """The forward model: distortion coefficients to expected counts, and their derivatives.
 
-    mu(u, v) = background + sum_s F_s p(u - x_s + f, v - y_s + g) |D|,    D = (1 + f_u)(1 + g_v) - f_v g_u
+    mu(u, v) = background + sum_s F_s p(u - x_s + f, v - y_s + g) |D|,    D = (1 + f_u)(1 + g_v) -
+    f_v g_u
 
-|D| makes each source's kernel integrate to one over the image, the constraint that Sun & Zhou state below
-their Eq. 1; their simulated kernel leaves it out, and so does `conserve_flux=False`. The sums over pixels are in
-`kernels`; `inference/posterior.py` compares the result with counts.
+|D| makes each source's kernel integrate to one over the image, the constraint that Sun & Zhou state
+below their Eq. 1; their simulated kernel leaves it out, and so does `conserve_flux=False`. The sums
+over pixels are in `kernels`; `inference/posterior.py` compares the result with counts.
 """
 
 import math
@@ -17,18 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesfred.errors import InputError
+from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
-from bayesfred.imaging.kernels.images import image
+from bayesfred.imaging.kernels.geometry import Optics, stride
 from bayesfred.imaging.kernels.jacobian import Basis, jacobian
-from bayesfred.imaging.kernels.maps import Optics, stride
+from bayesfred.imaging.kernels.render import image
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import FWHM, PSF, read_psf
-from bayesfred.imaging.scene import SourceCatalog
 
 Floats = npt.NDArray[np.float64]
 
-# An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2): 1 % at this width.
+# An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2):
+# 1 % at this width.
 NARROWEST_IMPULSE = math.sqrt(math.log(400.0) / (2.0 * math.pi**2))
 
 
@@ -45,12 +47,13 @@ class ForwardModel:
     psf : GaussianPSF, MoffatPSF or SampledPSF
         Reference PSF at the axis.
     distortion : PolynomialDistortion or LogDistortion
-        The terms of f and g. What is not polynomial can be simulated, not fitted: it has expected counts alone.
+        The terms of f and g. What is not polynomial can be simulated, not fitted: it has expected
+        counts alone.
     conserve_flux : bool
         Whether the kernel carries |D|. False is the kernel as the paper prints it.
     tolerance : float
-        Pixels where the PSF is below `tolerance` times its peak may be left out; 0 visits every pixel for every
-        source.
+        Pixels where the PSF is below `tolerance` times its peak may be left out; 0 visits every
+        pixel for every source.
 
     Raises
     ------
@@ -84,22 +87,29 @@ class ForwardModel:
             raise InputError(f"model: tolerance: got {self.tolerance}, expected 0 <= tolerance < 1")
         if self.detector.pixel == "impulse" and self.psf.sigma < NARROWEST_IMPULSE:
             raise InputError(
-                f"psf: sigma: got {self.psf.sigma:.4g} pixel with pixel = 'impulse', narrower than the pixel: expected at least "
-                f"{NARROWEST_IMPULSE:.2f} (a FWHM of {NARROWEST_IMPULSE * FWHM:.1f}), below which sampled flux depends on the "
+                f"psf: sigma: got {self.psf.sigma:.4g} pixel with pixel = 'impulse', narrower "
+                "than the pixel: expected at least "
+                f"{NARROWEST_IMPULSE:.2f} (a FWHM of {NARROWEST_IMPULSE * FWHM:.1f}), below which "
+                "sampled flux depends on the "
                 "sub-pixel position; use pixel = 'box'"
             )
 
     def optics(self, narrowest: float | None = None) -> Optics:
         """The model as the compiled loops need it, with pixels integrated well for PSFs of widths down to `narrowest` (pixel)."""
         if isinstance(self.distortion, LogDistortion):
-            raise InputError("distortion: got LogDistortion, expected PolynomialDistortion: what is not polynomial is not fitted")
+            raise InputError(
+                "distortion: got LogDistortion, expected PolynomialDistortion: what is not "
+                "polynomial is not fitted"
+            )
         f = np.array(self.distortion.f_terms, dtype=np.int64).reshape(-1, 4)
         g = np.array(self.distortion.g_terms, dtype=np.int64).reshape(-1, 4)
         degree = max(1, int(np.concatenate([f, g])[:, 2:].max()))
         x, y = self.sources.x[:, None], self.sources.y[:, None]
         ny, nx = self.detector.shape
         width, beta = self.psf.core
-        offsets, weights = self.detector.quadrature(width if narrowest is None else width * narrowest / self.psf.sigma, beta)
+        offsets, weights = self.detector.quadrature(
+            width if narrowest is None else width * narrowest / self.psf.sigma, beta
+        )
         return Optics(
             psf=self.psf.profile,
             x=self.sources.x,
@@ -189,8 +199,9 @@ class ForwardModel:
     def jacobian(self, theta: npt.ArrayLike) -> Floats:
         """Derivatives of the expected counts with respect to theta.
 
-        For an f-term with monomial B, F [p_a B |D| + p sign(D) (B_u (1 + g_v) - B_v g_u)]; for a g-term
-        F [p_b B |D| + p sign(D) (B_v (1 + f_u) - B_u f_v)]; without flux conservation the first half alone.
+        For an f-term with monomial B, F [p_a B |D| + p sign(D) (B_u (1 + g_v) - B_v g_u)]; for a
+        g-term F [p_b B |D| + p sign(D) (B_v (1 + f_u) - B_u f_v)]; without flux conservation the
+        first half alone.
 
         Parameters
         ----------
@@ -202,14 +213,17 @@ class ForwardModel:
         """
         ny, nx = self.detector.shape
         out = np.zeros((self.distortion.n_terms, ny, stride(nx)))
-        jacobian(self._optics, self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out)
+        jacobian(
+            self._optics, self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out
+        )
         return out[:, :, :nx]
 
     def _check(self, theta: npt.ArrayLike) -> Floats:
         values = np.ascontiguousarray(theta, dtype=np.float64)
         if values.shape != (self.distortion.n_terms,):
             raise InputError(
-                f"theta: got shape {values.shape}, expected ({self.distortion.n_terms},): " + ", ".join(self.distortion.names)
+                f"theta: got shape {values.shape}, expected ({self.distortion.n_terms},): "
+                + ", ".join(self.distortion.names)
             )
         return values
 

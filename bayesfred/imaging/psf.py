@@ -1,8 +1,9 @@
 """Reference point spread functions: the p of the Fredholm model, normalised to unit volume.
 
-Every kind has one width, `sigma`: that of the Gaussian with the same full width at half maximum, FWHM = 2.355 sigma. Where
-inference leaves the PSF's width free, this is the parameter, and p widens as a whole, p(a s, b s) s^2 with s the ratio of widths.
-`forward.py` samples PSFs through the compiled loops; lengths are in pixels of the fine grid.
+Every kind has one width, `sigma`: that of the Gaussian with the same full width at half maximum,
+FWHM = 2.355 sigma. Where inference leaves the PSF's width free, this is the parameter, and p widens
+as a whole, p(a s, b s) s^2 with s the ratio of widths. `forward.py` samples PSFs through the
+compiled loops; lengths are in pixels of the fine grid.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from scipy import linalg, ndimage, special
 
 from bayesfred.errors import InputError
-from bayesfred.imaging.kernels.profiles import Gaussian, Moffat, Spline
+from bayesfred.imaging.kernels.psf_profiles import Gaussian, Moffat, Spline
 
 Floats = npt.NDArray[np.float64]
 
@@ -97,15 +98,17 @@ class GaussianPSF:
 class MoffatPSF:
     """Circular Moffat function, p(a, b) = (beta - 1) / (pi alpha^2) (1 + (a^2 + b^2) / alpha^2)^-beta.
 
-    Its wings fall as a power and reach far: with beta 3 it is above 1e-8 of its peak within 21 alpha. Beyond a tolerance t lies
-    the part t^(1 - 1/beta) of the flux, which is not counted: 5e-6 of it in this case.
+    Its wings fall as a power and reach far: with beta 3 it is above 1e-8 of its peak within 21
+    alpha. Beyond a tolerance t lies the part t^(1 - 1/beta) of the flux, which is not counted: 5e-6
+    of it in this case.
 
     Parameters
     ----------
     fwhm : float, pixel
         Full width at half maximum, 2 alpha sqrt(2^(1/beta) - 1).
     beta : float
-        Exponent of the wings: > 1, without which their flux has no bound, and at most 100. It tends to a Gaussian as beta grows.
+        Exponent of the wings: > 1, without which their flux has no bound, and at most 100. It tends
+        to a Gaussian as beta grows.
 
     Raises
     ------
@@ -114,8 +117,8 @@ class MoffatPSF:
 
     References
     ----------
-    A. F. J. Moffat, "A theoretical investigation of focal stellar images in the photographic emulsion and application to
-    photographic photometry", Astronomy & Astrophysics 3, 455 (1969).
+    A. F. J. Moffat, "A theoretical investigation of focal stellar images in the photographic
+    emulsion and application to photographic photometry", Astronomy & Astrophysics 3, 455 (1969).
 
     Examples
     --------
@@ -132,7 +135,8 @@ class MoffatPSF:
             raise InputError(f"psf: fwhm: got {self.fwhm}, expected a positive width in pixels")
         if not 1.0 < self.beta <= LARGEST_BETA:
             raise InputError(
-                f"psf: beta: got {self.beta}, expected 1 < beta <= {LARGEST_BETA:g}: use a Gaussian in place of larger ones"
+                f"psf: beta: got {self.beta}, expected 1 < beta <= {LARGEST_BETA:g}: use a "
+                "Gaussian in place of larger ones"
             )
         object.__setattr__(self, "fwhm", float(self.fwhm))
         object.__setattr__(self, "beta", float(self.beta))
@@ -165,11 +169,17 @@ class MoffatPSF:
 
     def reach(self, tolerance: float) -> float:
         """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel."""
-        return self.alpha * math.sqrt(tolerance ** (-1.0 / self.beta) - 1.0) if tolerance > 0 else math.inf
+        return (
+            self.alpha * math.sqrt(tolerance ** (-1.0 / self.beta) - 1.0)
+            if tolerance > 0
+            else math.inf
+        )
 
     def density(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Floats:
         """The PSF at (a, b), pixel from its middle; per square pixel."""
-        return np.asarray(self.peak * (1.0 + (np.square(a) + np.square(b)) / self.alpha**2) ** -self.beta)
+        return np.asarray(
+            self.peak * (1.0 + (np.square(a) + np.square(b)) / self.alpha**2) ** -self.beta
+        )
 
     def write(self, group: Any) -> None:
         """Store the PSF in an HDF5 group."""
@@ -186,8 +196,9 @@ class MoffatPSF:
 class SampledPSF:
     """A PSF of any shape, given by samples: the cubic spline through them, scaled to unit volume.
 
-    The spline is twice continuously differentiable everywhere, falls to zero within two samples of the outermost ones, and is
-    zero beyond. Samples may be negative, as measured ones are in their wings; their sum may not.
+    The spline is twice continuously differentiable everywhere, falls to zero within two samples of
+    the outermost ones, and is zero beyond. Samples may be negative, as measured ones are in their
+    wings; their sum may not.
 
     Parameters
     ----------
@@ -204,12 +215,13 @@ class SampledPSF:
     Raises
     ------
     InputError
-        If the samples are not finite, their sum is not positive, or n is even, less than 3 or more than 1001; if `oversampling`
-        is less than 1 or more than 1001.
+        If the samples are not finite, their sum is not positive, or n is even, less than 3 or more
+        than 1001; if `oversampling` is less than 1 or more than 1001.
 
     References
     ----------
-    M. Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine 16, 22 (1999).
+    M. Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing
+    Magazine 16, 22 (1999).
 
     Examples
     --------
@@ -226,37 +238,55 @@ class SampledPSF:
         try:
             values = np.array(self.values, dtype=np.float64)
         except (TypeError, ValueError):
-            raise InputError("psf: values: not numbers, expected samples on a square grid") from None
+            raise InputError(
+                "psf: values: not numbers, expected samples on a square grid"
+            ) from None
         n = len(values) if values.ndim == 2 else 0
         if values.shape != (n, n) or n % 2 == 0 or not 3 <= n <= MOST_SAMPLES:
             raise InputError(
-                f"psf: values: got shape {values.shape}, expected (n, n) with n odd, 3 to {MOST_SAMPLES}: cut or pad them so that "
+                f"psf: values: got shape {values.shape}, expected (n, n) with n odd, 3 to "
+                f"{MOST_SAMPLES}: cut or pad them so that "
                 "the PSF's middle is in the middle"
             )
         if not np.isfinite(values).all():
             raise InputError(
-                f"psf: values: got {np.sum(~np.isfinite(values))} that are not finite, expected numbers: fill them first"
+                f"psf: values: got {np.sum(~np.isfinite(values))} that are not finite, expected "
+                "numbers: fill them first"
             )
         if not 1.0 <= self.oversampling <= MOST_SAMPLES:
-            raise InputError(f"psf: oversampling: got {self.oversampling}, expected samples per pixel, 1 to {MOST_SAMPLES}")
+            raise InputError(
+                f"psf: oversampling: got {self.oversampling}, expected samples per pixel, 1 to "
+                f"{MOST_SAMPLES}"
+            )
         with np.errstate(over="ignore", invalid="ignore"):
             total, scale = float(values.sum()), float(_coefficients(values).sum())
         if not (0.0 < total < math.inf and 0.0 < scale < math.inf):
-            raise InputError(f"psf: values: got a sum of {total:.4g}, expected a positive one: subtract less background")
+            raise InputError(
+                f"psf: values: got a sum of {total:.4g}, expected a positive one: subtract less "
+                "background"
+            )
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "oversampling", float(self.oversampling))
 
     @classmethod
     def measured(
-        cls, counts: npt.ArrayLike, position: Sequence[float], half_width: int, *, background: float = 0.0, oversampling: int = 4
+        cls,
+        counts: npt.ArrayLike,
+        position: Sequence[float],
+        half_width: int,
+        *,
+        background: float = 0.0,
+        oversampling: int = 4,
     ) -> Self:
         """Measure the PSF on a spot that stands alone, near the axis where distortion vanishes.
 
-        Whittaker and Shannon's interpolation in its finite form: a spot that is band-limited and dark at its window's border is the
-        trigonometric polynomial through its pixels. Samples are exact for a Gaussian of sigma >= 2 pixels to 1e-7 of the peak, and
-        the noise of the counts goes into them as it is. Of a frame that integrates over pixels the PSF is measured with the pixel
-        in it: fit with impulse pixels, or take the pixel out of the frame first with `correct_sampling`.
+        Whittaker and Shannon's interpolation in its finite form: a spot that is band-limited and
+        dark at its window's border is the trigonometric polynomial through its pixels. Samples are
+        exact for a Gaussian of sigma >= 2 pixels to 1e-7 of the peak, and the noise of the counts
+        goes into them as it is. Of a frame that integrates over pixels the PSF is measured with the
+        pixel in it: fit with impulse pixels, or take the pixel out of the frame first with
+        `correct_sampling`.
 
         Parameters
         ----------
@@ -298,20 +328,28 @@ class SampledPSF:
         if frame.ndim != 2:
             raise InputError(f"counts: got shape {frame.shape}, expected two dimensions (ny, nx)")
         if operator.index(half_width) < 1 or operator.index(oversampling) < 1:
-            raise InputError(f"psf: got half_width {half_width} and oversampling {oversampling}, expected both at least 1")
-        reach = math.floor((half_width - 0.5) * oversampling)  # so that no sample lies outside of the window
+            raise InputError(
+                f"psf: got half_width {half_width} and oversampling {oversampling}, expected both "
+                "at least 1"
+            )
+        reach = math.floor(
+            (half_width - 0.5) * oversampling
+        )  # so that no sample lies outside of the window
         matrices, window = [], []
         for centre, size in zip(position, frame.shape[::-1], strict=True):
             place = centre + 0.5 * (size - 1)
             first = round(place) - half_width if math.isfinite(place) else -1
             if not 0 <= first <= size - 2 * half_width - 1:
                 raise InputError(
-                    f"psf: position: got {tuple(position)} with half_width {half_width}, expected the window within the frame of "
+                    f"psf: position: got {tuple(position)} with half_width {half_width}, expected "
+                    "the window within the frame of "
                     f"{frame.shape[1]} x {frame.shape[0]} pixels from its middle"
                 )
             n = 2 * half_width + 1
             samples = place + np.arange(-reach, reach + 1) / oversampling
-            matrices.append(special.diric(2.0 * np.pi / n * (samples[:, None] - np.arange(first, first + n)), n))
+            matrices.append(
+                special.diric(2.0 * np.pi / n * (samples[:, None] - np.arange(first, first + n)), n)
+            )
             window.append(slice(first, first + n))
         spot = frame[window[1], window[0]] - background
         return cls(matrices[1] @ spot @ matrices[0].T, oversampling)
@@ -350,7 +388,8 @@ class SampledPSF:
     def reach(self, tolerance: float) -> float:
         """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel.
 
-        Between samples the spline does not exceed the largest of the 4 x 4 coefficients that make it.
+        Between samples the spline does not exceed the largest of the 4 x 4 coefficients that make
+        it.
         """
         if tolerance == 0.0:
             return math.inf
@@ -358,7 +397,9 @@ class SampledPSF:
         four = np.lib.stride_tricks.sliding_window_view(c, (4, 4)).max(axis=(2, 3))
         j, i = np.nonzero(four >= tolerance * self.peak / self.oversampling**2)
         half = 0.5 * (len(four) - 1)  # a cell's middle is so far from the first cell's
-        return float(np.hypot(np.abs(i - half) + 0.5, np.abs(j - half) + 0.5).max() / self.oversampling)
+        return float(
+            np.hypot(np.abs(i - half) + 0.5, np.abs(j - half) + 0.5).max() / self.oversampling
+        )
 
     def density(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Floats:
         """The PSF at (a, b), pixel from its middle; per square pixel."""

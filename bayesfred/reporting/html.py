@@ -1,8 +1,8 @@
 """One self-contained HTML page about a run: verdict, tables, figures, provenance.
 
-The page loads nothing from elsewhere and runs no script, so that it can be mailed, archived and opened
-years later. Text that comes from a user is escaped by the template engine. `bayesfred.analysis.diagnostics`
-supplies the numbers and `bayesfred.reporting.plots` the figures.
+The page loads nothing from elsewhere and runs no script, so that it can be mailed, archived and
+opened years later. Text that comes from a user is escaped by the template engine.
+`bayesfred.analysis.diagnostics` supplies the numbers and `bayesfred.reporting.plots` the figures.
 """
 
 import base64
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.errors import printable
-from bayesfred.inference.chainfile import Chain
-from bayesfred.inference.posterior import Posterior
+from bayesfred.model.posterior import Posterior
 from bayesfred.reporting import plots
+from bayesfred.sampling.chainfile import Chain
 
 __all__ = ["write_report"]
 
@@ -122,7 +122,9 @@ def write_report(
     return path
 
 
-def _rows(chain: Chain, diagnostics: Diagnostics, draws: Floats, truth: Floats | None) -> list[_Row]:
+def _rows(
+    chain: Chain, diagnostics: Diagnostics, draws: Floats, truth: Floats | None
+) -> list[_Row]:
     rows = []
     for k, name in enumerate(chain.parameter_names):
         mean, sd = float(draws[:, k].mean()), float(draws[:, k].std())
@@ -159,11 +161,14 @@ def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
         ),
         _statistic(
             "Deviance", d.deviance, d.deviance_expected, d.deviance_sd,
-            "twice the log-likelihood that a perfect model would gain; expectation exact for any mean count",
+            "twice the log-likelihood that a perfect model would gain; expectation exact for any "
+            "mean count",
         ),
         _Statistic(
-            "χ² of Sun & Zhou", _general(d.chi2_paper), "1" if math.isfinite(d.chi2_paper) else "", "", "",
-            "variance of counts − source image over the background; exceeds 1 where sources add noise",
+            "χ² of Sun & "
+            "Zhou", _general(d.chi2_paper), "1" if math.isfinite(d.chi2_paper) else "", "", "",
+            "variance of counts − source image over the background; exceeds 1 where sources add "
+            "noise",
         ),
         _Statistic(
             "λ̂ of Sun & Zhou", _general(d.background_estimate), "", "", "",
@@ -173,10 +178,14 @@ def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
 
 
 def _statistic(name: str, value: float, expected: float, sd: float, meaning: str) -> _Statistic:
-    return _Statistic(name, f"{value:.1f}", f"{expected:.1f}", f"{sd:.1f}", _z(value - expected, sd), meaning)
+    return _Statistic(
+        name, f"{value:.1f}", f"{expected:.1f}", f"{sd:.1f}", _z(value - expected, sd), meaning
+    )
 
 
-def _figures(chain: Chain, posterior: Posterior, draws: Floats, truth: Floats | None) -> list[tuple[str, str, str]]:
+def _figures(
+    chain: Chain, posterior: Posterior, draws: Floats, truth: Floats | None
+) -> list[tuple[str, str, str]]:
     """Heading, caption and data URI of each figure."""
     counts, mask = posterior.counts, posterior.mask
     expected = posterior.expected_counts(chain.estimate.params)
@@ -190,17 +199,25 @@ def _figures(chain: Chain, posterior: Posterior, draws: Floats, truth: Floats | 
         ),
         (
             "Brightest sources",
-            "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced source.",
-            _data_uri(plots.star_panels(counts, expected, sigma, mask, u, v, half_width=half_width)),
+            "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced "
+            "source.",
+            _data_uri(
+                plots.star_panels(counts, expected, sigma, mask, u, v, half_width=half_width)
+            ),
         ),
         (
             "Posterior",
             "Contours hold 39 % and 86 % of the draws.",
-            _data_uri(plots.corner_plot(draws, chain.parameter_names, truth=truth, estimate=chain.estimate.params)),
+            _data_uri(
+                plots.corner_plot(
+                    draws, chain.parameter_names, truth=truth, estimate=chain.estimate.params
+                )
+            ),
         ),
         (
             "Chain",
-            "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat at 1 when "
+            "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
+            "at 1 when "
             "all ensembles draw from one distribution.",
             _data_uri(plots.trace_plot(chain)),
         ),
@@ -227,10 +244,16 @@ def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]
         ("seed", str(chain.seed)),
         ("sampler", f"{n_ensembles} ensembles of {n_walkers} walkers"),
         ("steps", f"{n_steps}, {chain.burn_in} of them burn-in"),
-        ("draws", f"{diagnostics.n_draws} of {d} parameters, acceptance {diagnostics.acceptance:.1%}"),
+        (
+            "draws",
+            f"{diagnostics.n_draws} of {d} parameters, acceptance {diagnostics.acceptance:.1%}",
+        ),
         ("MAP", f"{chain.estimate.message} ({chain.estimate.n_evaluations} evaluations)"),
         ("pixels used", str(diagnostics.n_pixels)),
-        ("versions", ", ".join(f"{name} {version}" for name, version in sorted(chain.versions.items()))),
+        (
+            "versions",
+            ", ".join(f"{name} {version}" for name, version in sorted(chain.versions.items())),
+        ),
     ]
 
 
@@ -283,7 +306,9 @@ def _symbol(name: str) -> Markup:
     if term is None:
         return Markup("{}").format(name.replace("_", " "))
     powers = Markup("").join(
-        Markup("{}").format(variable) if power == 1 else Markup("{}<sup>{}</sup>").format(variable, power)
+        Markup("{}").format(variable)
+        if power == 1
+        else Markup("{}<sup>{}</sup>").format(variable, power)
         for variable, power in term[1]
     )
     letter = Markup("<i>{}</i>").format(term[0]) if len(term[0]) == 1 else term[0]

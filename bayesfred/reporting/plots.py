@@ -1,10 +1,10 @@
 """Figures of a run: the posterior, the chain behind it, and the frame against its model.
 
-Every function returns a `matplotlib.figure.Figure` that belongs to no window and no pyplot state; the
-caller saves it. Parameters are shown multiplied by a power of ten that their label states, because a
-distortion coefficient is a few millionths. Frames are drawn with u to the right and v upwards, in pixels
-from the middle of the frame, as the model counts them. `bayesfred.reporting.html` puts the figures on one
-page.
+Every function returns a `matplotlib.figure.Figure` that belongs to no window and no pyplot state;
+the caller saves it. Parameters are shown multiplied by a power of ten that their label states,
+because a distortion coefficient is a few millionths. Frames are drawn with u to the right and v
+upwards, in pixels from the middle of the frame, as the model counts them.
+`bayesfred.reporting.html` puts the figures on one page.
 """
 
 import io
@@ -26,11 +26,11 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
 
-from bayesfred.analysis.refit import LEVELS
+from bayesfred.analysis.ecdf_bands import band, ecdf, points
+from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
-from bayesfred.analysis.study import VARIABLES, NoiseStudy
-from bayesfred.analysis.uniformity import band, ecdf, points
-from bayesfred.inference.chainfile import Chain
+from bayesfred.analysis.study_helpers import LEVELS
+from bayesfred.sampling.chainfile import Chain
 
 __all__ = [
     "calibration_plot",
@@ -46,7 +46,16 @@ __all__ = [
     "trace_plot",
 ]
 
-ENSEMBLE_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#000000")
+ENSEMBLE_COLOURS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#7f7f7f",
+    "#000000",
+)
 TRUTH_COLOUR = "#d55e00"
 ESTIMATE_COLOUR = "#009e73"
 POSTERIOR_COLOUR = "#0072b2"
@@ -98,7 +107,11 @@ def parameter_unit(name: str) -> tuple[str, int]:
     term = parameter_powers(name)
     if term is not None:
         # the background's u and v run from -1 to 1 over the frame
-        return ("counts", 0) if term[0] == "background" else ("", 1 - sum(power for _, power in term[1]))
+        return (
+            ("counts", 0)
+            if term[0] == "background"
+            else ("", 1 - sum(power for _, power in term[1]))
+        )
     return {"background": ("counts", 0), "flux_scale": ("", 0)}.get(name, ("", 1))
 
 
@@ -141,7 +154,9 @@ def corner_plot(
     draws = draws[:: -(-len(draws) // MAX_CORNER_DRAWS)] if len(draws) else np.zeros((1, d))
     ranges = [_span(draws[:, k], None if truth is None else truth[k]) for k in range(d)]
     scale = 10.0 ** np.array([power_of_ten(np.array(span)) for span in ranges])
-    labels = [_label(name, round(math.log10(s)), "\n") for name, s in zip(names, scale, strict=True)]
+    labels = [
+        _label(name, round(math.log10(s)), "\n") for name, s in zip(names, scale, strict=True)
+    ]
     side = 1.6 + 1.0 * d
     fig = Figure(figsize=(side, side), dpi=100)
     fig.subplots(d, d, squeeze=False)
@@ -185,7 +200,9 @@ def corner_plot(
                 ticks = np.asarray(MaxNLocator(3).tick_values(low, high))
                 axis.set_ticks(ticks[(ticks > low + edge) & (ticks < high - edge)])
     margin = 0.75 / side
-    fig.subplots_adjust(left=1.3 * margin, bottom=1.3 * margin, right=1 - 0.2 / side, top=1 - 0.2 / side)
+    fig.subplots_adjust(
+        left=1.3 * margin, bottom=1.3 * margin, right=1 - 0.2 / side, top=1 - 0.2 / side
+    )
     if marked:
         handles = [Line2D([], [], color=colour, linestyle=style) for _, colour, style in marked]
         fig.legend(
@@ -201,8 +218,9 @@ def corner_plot(
 def trace_plot(chain: Chain) -> Figure:
     """Every parameter's ensembles over the steps, and the ranks of each ensemble's draws.
 
-    A band holds the middle 68 % of an ensemble's walkers, a line is their median, the burn-in is shaded.
-    The rank histogram beside it is flat at 1 for every ensemble when all draw from one distribution.
+    A band holds the middle 68 % of an ensemble's walkers, a line is their median, the burn-in is
+    shaded. The rank histogram beside it is flat at 1 for every ensemble when all draw from one
+    distribution.
 
     Parameters
     ----------
@@ -219,7 +237,9 @@ def trace_plot(chain: Chain) -> Figure:
     # the third column keeps a distance
     axes = fig.subplots(rows, 5, squeeze=False, width_ratios=(4, 1, 0.8, 4, 1))
     height = fig.get_figheight()
-    fig.subplots_adjust(left=0.08, right=0.99, bottom=0.5 / height, top=1 - 0.4 / height, wspace=0.1, hspace=0.2)
+    fig.subplots_adjust(
+        left=0.08, right=0.99, bottom=0.5 / height, top=1 - 0.4 / height, wspace=0.1, hspace=0.2
+    )
     steps = np.unique(np.linspace(0, n_steps - 1, min(n_steps, MAX_TRACE_STEPS)).astype(int))
     for k, name in enumerate(chain.parameter_names):
         # down the first pair of columns, then down the second, as the table of parameters runs
@@ -259,7 +279,8 @@ def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) 
     counts, expected, sigma : ndarray, shape (ny, nx), counts per pixel
         Frame, model, and the standard deviation that the noise model gives each pixel.
     mask : ndarray of bool, shape (ny, nx)
-        True where a pixel enters the likelihood; the others are grey in the residual, and in the frame if they are empty.
+        True where a pixel enters the likelihood; the others are grey in the residual, and in the
+        frame if they are empty.
 
     Returns
     -------
@@ -270,11 +291,20 @@ def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) 
     return fig
 
 
-def star_panels(counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: Floats, v: Floats, *, half_width: int) -> Figure:
+def star_panels(
+    counts: Floats,
+    expected: Floats,
+    sigma: Floats,
+    mask: Mask,
+    u: Floats,
+    v: Floats,
+    *,
+    half_width: int,
+) -> Figure:
     """Cut-outs around the brightest sources: counts, model and residual side by side.
 
-    Counts and model of a source share a scale; all residuals share one, so that a misplaced source shows as a
-    dipole.
+    Counts and model of a source share a scale; all residuals share one, so that a misplaced source
+    shows as a dipole.
 
     Parameters
     ----------
@@ -283,7 +313,8 @@ def star_panels(counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: 
     mask : ndarray of bool, shape (ny, nx)
         True where a pixel enters the likelihood; the others are grey in counts and residual.
     u, v : ndarray, shape (n_sources,), pixel
-        Positions from the middle of the frame; at most the 24 brightest that lie in the frame are shown.
+        Positions from the middle of the frame; at most the 24 brightest that lie in the frame are
+        shown.
     half_width : int
         A stamp has 2 half_width + 1 pixels a side.
 
@@ -293,7 +324,10 @@ def star_panels(counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: 
     """
     ny, nx = counts.shape
     # a source without an image has the position nan, far outside for what follows
-    column, row = (np.rint(np.nan_to_num(place, nan=-1e9) + (n - 1) / 2).astype(int) for place, n in ((u, nx), (v, ny)))
+    column, row = (
+        np.rint(np.nan_to_num(place, nan=-1e9) + (n - 1) / 2).astype(int)
+        for place, n in ((u, nx), (v, ny))
+    )
     inside = np.flatnonzero((column >= 0) & (column < nx) & (row >= 0) & (row < ny))
     stamp = partial(_stamp, half_width=half_width)
     light = [float(np.nansum(stamp(expected, column[s], row[s]))) for s in inside]
@@ -306,18 +340,30 @@ def star_panels(counts: Floats, expected: Floats, sigma: Floats, mask: Mask, u: 
         return fig
     used, residual = _recorded(counts, mask), _residual(counts, expected, sigma, mask)
     width, height = fig.get_size_inches()
-    outer = fig.add_gridspec(1, blocks, left=0.01, right=1 - 0.75 / width, bottom=0.01, top=1 - 0.42 / height, wspace=0.06)
+    outer = fig.add_gridspec(
+        1,
+        blocks,
+        left=0.01,
+        right=1 - 0.75 / width,
+        bottom=0.01,
+        top=1 - 0.42 / height,
+        wspace=0.06,
+    )
     for b in range(blocks):
         grid = outer[b].subgridspec(rows, 3, wspace=0.03, hspace=0.06)
         for r, s in enumerate(shown[b * rows : (b + 1) * rows]):
-            data, model, difference = (stamp(frame, column[s], row[s]) for frame in (used, expected, residual))
+            data, model, difference = (
+                stamp(frame, column[s], row[s]) for frame in (used, expected, residual)
+            )
             norm = _stretch(data, model)
             axes = [fig.add_subplot(grid[r, c]) for c in range(3)]
             _show(axes[0], data, norm, "viridis")
             _show(axes[1], model, norm, "viridis")
             last = _show(axes[2], difference, _sigma_norm(), "RdBu_r")
             place = f"{u[s]:+.0f}, {v[s]:+.0f}"
-            axes[1].text(0.04, 0.96, place, transform=axes[1].transAxes, va="top", color="white", fontsize=7)
+            axes[1].text(
+                0.04, 0.96, place, transform=axes[1].transAxes, va="top", color="white", fontsize=7
+            )
             for ax, title in zip(axes, ("counts", "model", "residual"), strict=True):
                 ax.set(xticks=[], yticks=[])
                 if r == 0:
@@ -354,8 +400,8 @@ def overview(
     draws : ndarray, shape (n, d), parameter units
     names : sequence of str, length d
     truth : ndarray, shape (d,), parameter units, optional
-        With it posteriors are shown as (draws - truth) / sd; without, the distortion's terms as draws / sd,
-        on an axis that is linear within +-3 and logarithmic beyond.
+        With it posteriors are shown as (draws - truth) / sd; without, the distortion's terms as
+        draws / sd, on an axis that is linear within +-3 and logarithmic beyond.
 
     Returns
     -------
@@ -367,7 +413,9 @@ def overview(
     z = (mean if truth is None else mean - truth)[kept] / sd[kept]
     heights = (_triptych_height(counts), 3.4)
     fig = Figure(figsize=(19, sum(heights)), dpi=100, layout="constrained")
-    parts: Any = fig.subfigures(2, 1, height_ratios=heights)  # an array, whatever the stubs of the version say
+    parts: Any = fig.subfigures(
+        2, 1, height_ratios=heights
+    )  # an array, whatever the stubs of the version say
     upper, lower = parts
     _draw_triptych(fig, upper.subplots(1, 3), counts, expected, sigma, mask)
     ax = lower.subplots()
@@ -387,7 +435,9 @@ def overview(
         ax.set_ylabel("(posterior mean - truth) / sd")
     ax.set_xlim(-0.7, len(kept) - 0.3)
     ticks = [f"{_symbol(names[k])}\n{_plain(mean[k], sd[k])}" for k in kept]
-    ax.set_xticks(place, ticks, fontsize=9 if len(kept) <= 16 else 7, rotation=0 if len(kept) <= 16 else 60)
+    ax.set_xticks(
+        place, ticks, fontsize=9 if len(kept) <= 16 else 7, rotation=0 if len(kept) <= 16 else 60
+    )
     return fig
 
 
@@ -407,7 +457,10 @@ def noise_plot(study: NoiseStudy) -> Figure:
     varied = [name for name in VARIABLES if len(set(cells[name])) > 1] or [VARIABLES[0]]
     abscissa, others = varied[0], varied[1:]
     of = np.array(
-        [", ".join(f"{name.replace('_', ' ')} {cells[name][k]:g}" for name in others) for k in range(len(cells["failed"]))]
+        [
+            ", ".join(f"{name.replace('_', ' ')} {cells[name][k]:g}" for name in others)
+            for k in range(len(cells["failed"]))
+        ]
     )
     series = list(dict.fromkeys(of.tolist()))
     names = study.parameter_names
@@ -421,21 +474,43 @@ def noise_plot(study: NoiseStudy) -> Figure:
     efficiency, coverage = lower.subplots(1, 2)
     for s, label in enumerate(series):
         colour = ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)]
-        aside = 1.0 + 0.05 * (s - 0.5 * (len(series) - 1))  # so that points of a noise level do not hide each other
+        aside = 1.0 + 0.05 * (
+            s - 0.5 * (len(series) - 1)
+        )  # so that points of a noise level do not hide each other
         for ax, name in zip(widths, names, strict=False):
             mine = np.flatnonzero((cells["parameter"] == name) & (of == label))
-            x, width, bound, scatter = (cells[key][mine] for key in (abscissa, "width", "bound", "scatter"))
+            x, width, bound, scatter = (
+                cells[key][mine] for key in (abscissa, "width", "bound", "scatter")
+            )
             order = np.argsort(x)
             error = scatter / np.sqrt(2.0 * np.maximum(cells["frames"][mine] - 1, 1))
             ax.plot(x[order], bound[order], color=colour, linewidth=1.0)
-            ax.errorbar(x * 1.04, scatter, error, fmt="s", mfc="white", color=colour, markersize=4.5, linewidth=1.0)
+            ax.errorbar(
+                x * 1.04,
+                scatter,
+                error,
+                fmt="s",
+                mfc="white",
+                color=colour,
+                markersize=4.5,
+                linewidth=1.0,
+            )
             ax.plot(x / 1.04, width, "o", color=colour, markersize=4.5)
         mine = np.flatnonzero((cells["parameter"] == "theta") & (of == label))
         x = cells[abscissa][mine] * aside
-        efficiency.errorbar(x, cells["efficiency"][mine], cells["efficiency_error"][mine], fmt="o", color=colour, capsize=3)
+        efficiency.errorbar(
+            x,
+            cells["efficiency"][mine],
+            cells["efficiency_error"][mine],
+            fmt="o",
+            color=colour,
+            capsize=3,
+        )
         for level, mark in zip(LEVELS, "os", strict=True):
             key = f"coverage_{100 * level:.0f}"
-            coverage.errorbar(x, cells[key][mine], cells[f"{key}_error"][mine], fmt=mark, color=colour, capsize=3)
+            coverage.errorbar(
+                x, cells[key][mine], cells[f"{key}_error"][mine], fmt=mark, color=colour, capsize=3
+            )
     every = cells[abscissa]
     for ax in (*widths[: len(names)], efficiency, coverage):
         ax.set_xscale("log" if every.max() > 3.0 * every.min() else "linear")
@@ -451,23 +526,51 @@ def noise_plot(study: NoiseStudy) -> Figure:
     handles = [
         Line2D([], [], color="0.3", linewidth=1.0, label="Cramér–Rao bound"),
         Line2D([], [], color="0.3", linestyle="", marker="o", markersize=4.5, label="posterior sd"),
-        Line2D([], [], color="0.3", linestyle="", marker="s", markersize=4.5, mfc="white", label="scatter of the estimates"),
+        Line2D(
+            [],
+            [],
+            color="0.3",
+            linestyle="",
+            marker="s",
+            markersize=4.5,
+            mfc="white",
+            label="scatter of the estimates",
+        ),
         *(
-            Line2D([], [], linewidth=3.0, color=ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)], label=label)
+            Line2D(
+                [],
+                [],
+                linewidth=3.0,
+                color=ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)],
+                label=label,
+            )
             for s, label in enumerate(series)
         ),
     ][: 3 + (len(series) if others else 0)]
-    upper.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 6), frameon=False, fontsize=9)
+    upper.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=min(len(handles), 6),
+        frameon=False,
+        fontsize=9,
+    )
     efficiency.axhline(1.0, color="0.3", linewidth=0.8)
     efficiency.set(
-        xlabel=VARIABLE_LABELS[abscissa], ylabel="bound / variance of the estimates", title="efficiency, all coefficients"
+        xlabel=VARIABLE_LABELS[abscissa],
+        ylabel="bound / variance of the estimates",
+        title="efficiency, all coefficients",
     )
     for level in LEVELS:
         coverage.axhline(level, color="0.3", linewidth=0.8)
     coverage.set(
-        xlabel=VARIABLE_LABELS[abscissa], ylabel="share of intervals that hold the truth", title="coverage, all coefficients"
+        xlabel=VARIABLE_LABELS[abscissa],
+        ylabel="share of intervals that hold the truth",
+        title="coverage, all coefficients",
     )
-    low = min(0.5, float(np.nanmin(cells["coverage_68"][cells["parameter"] == "theta"], initial=0.5)) - 0.05)
+    low = min(
+        0.5,
+        float(np.nanmin(cells["coverage_68"][cells["parameter"] == "theta"], initial=0.5)) - 0.05,
+    )
     coverage.set_ylim(low, 1.02)
     coverage.set_yticks([*LEVELS, 1.0], [f"{level:.0%}" for level in (*LEVELS, 1.0)])
     return fig
@@ -503,7 +606,13 @@ def calibration_plot(calibration: PosteriorCalibration) -> Figure:
             off = ecdf(calibration.pit[names[k]])
             left = np.any((off < low - 1e-9) | (off > high + 1e-9))
             ax.fill_between(z, low - z, high - z, color="0.4", alpha=0.2, linewidth=0)
-            ax.step(z, off - z, where="post", color=TRUTH_COLOUR if left else POSTERIOR_COLOUR, linewidth=1.1)
+            ax.step(
+                z,
+                off - z,
+                where="post",
+                color=TRUTH_COLOUR if left else POSTERIOR_COLOUR,
+                linewidth=1.1,
+            )
             ax.axhline(0.0, color="0.3", linewidth=0.6)
             ax.set_title(f"{_quantity(names[k])}   p = {found['uniformity'][k]:.2g}", fontsize=9.5)
             ax.tick_params(labelsize=8, labelbottom=k + columns >= len(names))
@@ -519,18 +628,38 @@ def calibration_plot(calibration: PosteriorCalibration) -> Figure:
         key = f"coverage_{100 * level:.0f}"
         coverage.axhline(level, color="0.3", linewidth=0.8)
         coverage.errorbar(
-            place, found[key], yerr=found[f"{key}_error"], fmt=mark, color=POSTERIOR_COLOUR, capsize=3, markersize=4.5
+            place,
+            found[key],
+            yerr=found[f"{key}_error"],
+            fmt=mark,
+            color=POSTERIOR_COLOUR,
+            capsize=3,
+            markersize=4.5,
         )
-    coverage.set(title="share of intervals that hold the truth", ylim=(min(0.5, float(found["coverage_68"].min()) - 0.05), 1.02))
+    coverage.set(
+        title="share of intervals that hold the truth",
+        ylim=(min(0.5, float(found["coverage_68"].min()) - 0.05), 1.02),
+    )
     coverage.set_yticks([*LEVELS, 1.0], [f"{level:.0%}" for level in (*LEVELS, 1.0)])
     error = 1.0 / math.sqrt(n)
     pull.axhspan(-3.0 * error, 3.0 * error, color="0.4", alpha=0.15, linewidth=0)
     pull.axhline(0.0, color="0.3", linewidth=0.8)
-    pull.errorbar(place, found["pull"], yerr=error, fmt="o", color=POSTERIOR_COLOUR, capsize=3, markersize=4.5)
+    pull.errorbar(
+        place, found["pull"], yerr=error, fmt="o", color=POSTERIOR_COLOUR, capsize=3, markersize=4.5
+    )
     reach = max(4.5 * error, 1.15 * float(np.abs(found["pull"]).max()) + error)
-    pull.set(title="mean of (posterior mean - truth) / sd; band: 3 standard errors", ylim=(-reach, reach))
+    pull.set(
+        title="mean of (posterior mean - truth) / sd; band: 3 standard errors", ylim=(-reach, reach)
+    )
     for ax in (coverage, pull):
-        ax.set_xticks(place, [_quantity(name) for name in names], rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
+        ax.set_xticks(
+            place,
+            [_quantity(name) for name in names],
+            rotation=60,
+            ha="right",
+            rotation_mode="anchor",
+            fontsize=8,
+        )
     return fig
 
 
@@ -546,7 +675,9 @@ def _quantity(name: str) -> str:
     return re.sub(r"^([fg])\((.*)\)$", r"$\1$(\2) px", name) if "(" in name else _symbol(name)
 
 
-def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> None:
+def _draw_triptych(
+    fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask
+) -> None:
     """Frame, model and residual on three axes; the first two share a colour bar."""
     ny, nx = counts.shape
     extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
@@ -562,8 +693,12 @@ def _draw_triptych(fig: Figure, axes: Sequence[Axes], counts: Floats, expected: 
     ticks = _even_ticks(norm)
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()
-    residual = _show(axes[2], _residual(counts, expected, sigma, mask), _sigma_norm(), "RdBu_r", extent)
-    fig.colorbar(residual, cax=axes[2].inset_axes((1.02, 0.0, 0.035, 1.0)), label="residual / sigma")
+    residual = _show(
+        axes[2], _residual(counts, expected, sigma, mask), _sigma_norm(), "RdBu_r", extent
+    )
+    fig.colorbar(
+        residual, cax=axes[2].inset_axes((1.02, 0.0, 0.035, 1.0)), label="residual / sigma"
+    )
     for ax, title in zip(axes, ("frame", "model", "residual"), strict=True):
         ax.set(title=title, xlabel="u / pixel")
     axes[0].set_ylabel("v / pixel")
@@ -579,7 +714,9 @@ def _show(
     """An image whose pixels that are not finite are grey; unsmoothed, so that noise stays noise."""
     cmap: Colormap = colormaps[colours].with_extremes(bad=MASKED)
     image = np.ma.masked_invalid(frame)
-    return ax.imshow(image, cmap=cmap, norm=norm, extent=extent, origin="lower", interpolation="nearest")
+    return ax.imshow(
+        image, cmap=cmap, norm=norm, extent=extent, origin="lower", interpolation="nearest"
+    )
 
 
 def _recorded(counts: Floats, mask: Mask) -> Floats:
@@ -603,7 +740,9 @@ def _stretch(counts: Floats, expected: Floats) -> FuncNorm:
     both = expected[np.isfinite(expected)]
     low = float(np.min(both, initial=np.inf)) if both.size else 0.0
     noise = math.sqrt(max(low, 0.1))
-    low = max(low - 2.0 * noise, float(np.nanmin(counts, initial=np.inf)), 0.0) if both.size else 0.0
+    low = (
+        max(low - 2.0 * noise, float(np.nanmin(counts, initial=np.inf)), 0.0) if both.size else 0.0
+    )
     peak = float(np.max(both, initial=0.0))
     high = max(peak + 2.0 * math.sqrt(max(peak, 0.0)), low + 4.0 * noise)
     width = max(4.0 * noise, (high - low) / 1000.0)
@@ -647,7 +786,12 @@ def _rank_histogram(ax: Axes, draws: Floats) -> None:
     edges = np.linspace(0.0, max(draws.size, 1), 13)
     for e, own in enumerate(ranks):
         height = np.histogram(own, edges)[0] * 12.0 / max(own.size, 1)
-        ax.stairs(height, edges / edges[-1], color=ENSEMBLE_COLOURS[e % len(ENSEMBLE_COLOURS)], linewidth=1.0)
+        ax.stairs(
+            height,
+            edges / edges[-1],
+            color=ENSEMBLE_COLOURS[e % len(ENSEMBLE_COLOURS)],
+            linewidth=1.0,
+        )
     ax.axhline(1.0, color="0.5", linewidth=0.6, zorder=0)
     ax.set(xlim=(0, 1), ylim=(0, 2.2), xticks=[0, 0.5, 1], yticks=[0, 1, 2])
     ax.tick_params(labelsize=7, labelleft=False)
@@ -668,7 +812,9 @@ def _symbol(name: str) -> str:
     if term is None:
         return name.replace("_", " ")
     letter, factors = term
-    powers = " ".join(variable if power == 1 else f"{variable}^{power}" for variable, power in factors)
+    powers = " ".join(
+        variable if power == 1 else f"{variable}^{power}" for variable, power in factors
+    )
     return f"$b_{{{powers}}}$" if letter == "background" else f"${letter}_{{{powers}}}$"
 
 

@@ -1,8 +1,9 @@
 """Make the reference posteriors beside this file: `python chains/reference/make.py [paper] [faint] [free]`.
 
-Each is the run of a run file, long enough that every parameter has 10,000 effective draws, kept as means, standard deviations and
-quantiles with their Monte Carlo errors, and 500 of the draws. Walkers are independent but for the few steps of differential
-evolution, so the errors come from the scatter between the walkers' averages over time, whatever their autocorrelation.
+Each is the run of a run file, long enough that every parameter has 10,000 effective draws, kept as
+means, standard deviations and quantiles with their Monte Carlo errors, and 500 of the draws.
+Walkers are independent but for the few steps of differential evolution, so the errors come from the
+scatter between the walkers' averages over time, whatever their autocorrelation.
 """
 
 import hashlib
@@ -16,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 import bayesfred as bf
-from bayesfred import assembly, settings
-from bayesfred.inference.convergence import convergence
+from bayesfred import build, settings
+from bayesfred.sampling.convergence import convergence
 
 Floats = npt.NDArray[np.float64]
 
@@ -32,10 +33,12 @@ def posterior(name: str, **model: Any) -> bf.Posterior:
     path = FOLDER / f"{name}.toml"
     run = settings.read_settings(path)
     assert run.simulation is not None
-    made, _ = assembly.simulated(run, path, run.simulation.seed)
+    made, _ = build.simulated(run, path, run.simulation.seed)
     changed = run.model_copy(update={"model": run.model.model_copy(update=model)})
     sources, shape = made.model.sources, made.model.detector.shape
-    return assembly.posterior_given(changed, assembly.forward_model(changed, shape, sources, made.model.psf), made.counts, None)
+    return build.posterior_given(
+        changed, build.forward_model(changed, shape, sources, made.model.psf), made.counts, None
+    )
 
 
 def counts_hash(counts: Floats) -> str:
@@ -58,10 +61,16 @@ def summary(chain: bf.Chain) -> dict[str, dict[str, Any]]:
     for p in QUANTILES:
         value = np.quantile(draws, p, axis=0)
         share = error((kept < value).astype(float))
-        low, high = (np.array([np.quantile(x, q) for x, q in zip(draws.T, p + s * share, strict=True)]) for s in (-1, 1))
+        low, high = (
+            np.array([np.quantile(x, q) for x, q in zip(draws.T, p + s * share, strict=True)])
+            for s in (-1, 1)
+        )
         numbers[f"{p:.0%}"] = value, 0.5 * (high - low)
     return {
-        name: {what: {"value": value[k], "error": its_error[k]} for what, (value, its_error) in numbers.items()}
+        name: {
+            what: {"value": value[k], "error": its_error[k]}
+            for what, (value, its_error) in numbers.items()
+        }
         for k, name in enumerate(chain.parameter_names)
     }
 

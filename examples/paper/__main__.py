@@ -1,10 +1,12 @@
 """Make the paper's tables and figures anew.
 
     python -m examples.paper                   everything: README.md and pictures/ beside this file
-    python -m examples.paper table2 figure6    print these and make their pictures
-    python -m examples.paper --quick           print what takes no sampling, in half a minute (the tests compare it with README.md)
+    python -m examples.paper table2 figure6    print these and make their pictures python -m
+    examples.paper --quick           print what takes no sampling, in half a minute (the tests
+    compare it with README.md)
 
-Everything takes five to ten minutes on two cores. Seeds are fixed, so that a run again gives the same numbers up to rounding.
+Everything takes five to ten minutes on two cores. Seeds are fixed, so that a run again gives the
+same numbers up to rounding.
 """
 
 import argparse
@@ -29,11 +31,17 @@ def verdict(row: Row) -> str:
 
 
 def markdown(section: Section, pictures: str) -> str:
-    lines = [f"## {section.title}", "", section.text, ""] if section.text else [f"## {section.title}", ""]
+    lines = (
+        [f"## {section.title}", "", section.text, ""]
+        if section.text
+        else [f"## {section.title}", ""]
+    )
     if section.wide:
         lines += [section.wide, ""]
     lines += ["| quantity | paper | here | agrees | remark |", "|---|---|---|---|---|"]
-    lines += [f"| {r.quantity} | {r.printed} | {r.ours} | {verdict(r)} | {r.why} |" for r in section.rows]
+    lines += [
+        f"| {r.quantity} | {r.printed} | {r.ours} | {verdict(r)} | {r.why} |" for r in section.rows
+    ]
     lines += [f"\n![{section.title}]({pictures}{name})" for name in section.pictures]
     return "\n".join(lines) + "\n"
 
@@ -50,9 +58,15 @@ def summary(sections: list[Section]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m examples.paper", description="The paper's tables and figures made anew.")
-    parser.add_argument("names", nargs="*", choices=[*MODULES, []], help="which of " + ", ".join(MODULES))
-    parser.add_argument("--quick", action="store_true", help="leave out what needs sampling, and the pictures")
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.paper", description="The paper's tables and figures made anew."
+    )
+    parser.add_argument(
+        "names", nargs="*", choices=[*MODULES, []], help="which of " + ", ".join(MODULES)
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="leave out what needs sampling, and the pictures"
+    )
     given = parser.parse_args()
     everything = not given.names and not given.quick
     folder = HERE / "pictures"
@@ -62,7 +76,9 @@ def main() -> None:
         sections.append(import_module(f"{__package__}.{name}").make(given.quick, folder))
         print(markdown(sections[-1], "pictures/"), flush=True)
     if everything:
-        text = "\n".join([HEAD, summary(sections), *(markdown(section, "pictures/") for section in sections)])
+        text = "\n".join(
+            [HEAD, summary(sections), *(markdown(section, "pictures/") for section in sections)]
+        )
         (HERE / "README.md").write_text(text, encoding="utf-8")
 
 

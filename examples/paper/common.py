@@ -57,7 +57,9 @@ def paper_model(distortion: Any = DISTORTION, psf_sigma: float | None = None) ->
     o = PRINTED["object"]
     sources = bf.SourceCatalog.grid(o["sources"], o["spacing"], o["flux"])
     psf = bf.GaussianPSF(psf_sigma or o["psf_sigma"])
-    return bf.ForwardModel(bf.Detector(tuple(o["shape"])), sources, psf, distortion, conserve_flux=False)
+    return bf.ForwardModel(
+        bf.Detector(tuple(o["shape"])), sources, psf, distortion, conserve_flux=False
+    )
 
 
 def truth(table: str) -> Floats:
@@ -65,7 +67,9 @@ def truth(table: str) -> Floats:
     return np.array(PRINTED[table]["truth"]) * PRINTED[table]["unit"]
 
 
-def least_squares(model: bf.ForwardModel, frame: Floats, start: ArrayLike) -> tuple[Floats, Floats, float]:
+def least_squares(
+    model: bf.ForwardModel, frame: Floats, start: ArrayLike
+) -> tuple[Floats, Floats, float]:
     """The paper's fit of a frame without background: theta that minimises V, the residual image, V.
 
     V is the sum over pixels of squared residuals in units of a source's flux.
@@ -79,7 +83,9 @@ def least_squares(model: bf.ForwardModel, frame: Floats, start: ArrayLike) -> tu
     def slopes(theta: Floats) -> Floats:
         return np.asarray((model.jacobian(theta) / flux).reshape(start.size, -1).T)
 
-    theta = optimize.least_squares(residual, start, slopes, method="lm", x_scale="jac", ftol=1e-9, xtol=1e-9, gtol=1e-9).x
+    theta = optimize.least_squares(
+        residual, start, slopes, method="lm", x_scale="jac", ftol=1e-9, xtol=1e-9, gtol=1e-9
+    ).x
     left = residual(theta)
     for _ in range(5):  # Gauss-Newton steps, as far as rounding lets them gain
         matrix = slopes(theta)
@@ -97,7 +103,9 @@ def background_bound(model: bf.ForwardModel, theta: Floats, background: float) -
     jacobian = model.jacobian(theta).reshape(theta.size, -1)
     information = jacobian @ jacobian.T
     scale = 1.0 / np.sqrt(np.diag(information))
-    return np.asarray(linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale) * background)
+    return np.asarray(
+        linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale) * background
+    )
 
 
 @dataclass
@@ -109,7 +117,9 @@ class Fit:
     chain: bf.Chain | None = None
 
 
-def fit(posterior: bf.Posterior, quick: bool, name: str = "", near: Fit | None = None, **options: Any) -> Fit:
+def fit(
+    posterior: bf.Posterior, quick: bool, name: str = "", near: Fit | None = None, **options: Any
+) -> Fit:
     """Maximise, and unless it must be quick, draw: the chain file is kept while the program runs.
 
     `near` is a fit of a model with fewer terms, to begin from.
@@ -122,7 +132,14 @@ def fit(posterior: bf.Posterior, quick: bool, name: str = "", near: Fit | None =
     laplace = np.sqrt(np.diag(estimate.covariance))
     if quick:
         return Fit(estimate, laplace)
-    chain = bf.sample(posterior, estimate, path=Path(_chains().name) / f"{name}.h5", seed=1, progress=False, **options)
+    chain = bf.sample(
+        posterior,
+        estimate,
+        path=Path(_chains().name) / f"{name}.h5",
+        seed=1,
+        progress=False,
+        **options,
+    )
     return Fit(estimate, chain.draws().std(axis=0, ddof=1), chain)
 
 
@@ -181,14 +198,16 @@ def same(paper: float, ours: float, sd: float, rounding: float = 0.0) -> bool:
     return bool(abs(paper - ours) <= 3.0 * math.sqrt(2.0) * sd + rounding)
 
 
-# ------------------------------------------------------------------------------------------------------------------ pictures
+# --------------------------------------------------------------------------------------------------
 
 FONT = {"fontsize": 8}
 
 
 def panels(rows: int, columns: int, size: float = 2.5) -> tuple[Any, Any]:
     """A figure with a grid of axes for frames."""
-    figure = matplotlib.figure.Figure(figsize=(size * columns + 0.8, size * rows + 0.5), dpi=90, layout="constrained")
+    figure = matplotlib.figure.Figure(
+        figsize=(size * columns + 0.8, size * rows + 0.5), dpi=90, layout="constrained"
+    )
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
@@ -200,11 +219,21 @@ def name_axes(axes: Any, title: str, across: str, down: str) -> None:
     axes.tick_params(labelsize=7)
 
 
-def show(axes: Any, image: Floats, title: str, *, step: float = 1.0, colours: str = "viridis", **scale: Any) -> Any:
+def show(
+    axes: Any,
+    image: Floats,
+    title: str,
+    *,
+    step: float = 1.0,
+    colours: str = "viridis",
+    **scale: Any,
+) -> Any:
     """Draw a frame, v downwards as in the paper, coordinates from the middle in fine pixels."""
     ny, nx = image.shape
     extent = (-0.5 * nx * step, 0.5 * nx * step, 0.5 * ny * step, -0.5 * ny * step)
-    drawn = axes.imshow(image, extent=extent, cmap=colours, interpolation="nearest", aspect="equal", **scale)
+    drawn = axes.imshow(
+        image, extent=extent, cmap=colours, interpolation="nearest", aspect="equal", **scale
+    )
     name_axes(axes, title, "u / pixel", "v / pixel")
     axes.label_outer()
     return drawn
@@ -228,7 +257,7 @@ def save(figure: Any, name: str, folder: Path) -> str:
     """Write a picture with 256 colours, which makes it three times smaller."""
     drawn = io.BytesIO()
     figure.savefig(drawn)
-    Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        folder / name, optimize=True
-    )
+    Image.open(drawn).convert("RGB").quantize(
+        256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+    ).save(folder / name, optimize=True)
     return name

@@ -1,7 +1,8 @@
 """Fig. 5: the reference PSF, cut out around the central spot of Fig. 2b and interpolated (Whittaker-Shannon), against the true one.
 
-The paper's spots overlap: halfway to its neighbours, 25 pixels away, the central one has fallen to 4 % of its peak, and so have
-they. The same measurement on a source that stands alone shows what interpolation itself costs.
+The paper's spots overlap: halfway to its neighbours, 25 pixels away, the central one has fallen to
+4 % of its peak, and so have they. The same measurement on a source that stands alone shows what
+interpolation itself costs.
 """
 
 from pathlib import Path
@@ -29,7 +30,9 @@ def measured(frame: Floats, half_width: int) -> tuple[bf.SampledPSF, Floats, Flo
 def make(quick: bool, folder: Path) -> Section:
     model = paper_model()
     single = bf.SourceCatalog([0.0], [0.0], model.sources.flux[:1])
-    alone = bf.ForwardModel(model.detector, single, model.psf, model.distortion, conserve_flux=False, tolerance=0.0)
+    alone = bf.ForwardModel(
+        model.detector, single, model.psf, model.distortion, conserve_flux=False, tolerance=0.0
+    )
     frames = {"Fig. 2b": figure2("polynomial"), "alone": alone.expected_counts(np.zeros(12))}
     found = {name: measured(frame, HALF_WIDTHS[name]) for name, frame in frames.items()}
     _, offsets, error = found["Fig. 2b"]
@@ -40,7 +43,8 @@ def make(quick: bool, folder: Path) -> Section:
             "",
             f"{np.abs(error).max():.3f}",
             None,
-            f"at the window's border, ±{HALF_WIDTHS['Fig. 2b']} pixels: the neighbours' light is taken for the PSF's",
+            f"at the window's border, ±{HALF_WIDTHS['Fig. 2b']} pixels: the neighbours' light is "
+            "taken for the PSF's",
         ),
         Row("the same within 10 pixels (one sigma)", "", f"{np.abs(error[core]).max():.1e}", None),
         Row(
@@ -48,19 +52,24 @@ def make(quick: bool, folder: Path) -> Section:
             "",
             small(float(np.abs(found["alone"][2]).max())),
             None,
-            "interpolation of a band-limited spot that is dark at the border is exact but for rounding",
+            "interpolation of a band-limited spot that is dark at the border is exact but for "
+            "rounding",
         ),
     ]
     text = (
-        f"`SampledPSF.measured` interpolates to {OVERSAMPLING} samples a pixel. The paper extracts the spot at the axis, where "
-        "there is no distortion, and prints no error. In its own frame neighbours overlap, so that the measured wings are not the "
+        f"`SampledPSF.measured` interpolates to {OVERSAMPLING} samples a pixel. The paper "
+        "extracts the spot at the axis, where "
+        "there is no distortion, and prints no error. In its own frame neighbours overlap, so "
+        "that the measured wings are not the "
         "PSF's: for everything below the true PSF is used, as in the paper's section 4.1."
     )
     pictures = [] if quick else [_picture(frames["Fig. 2b"], found, folder)]
     return Section("Fig. 5: reference PSF", text, rows, pictures)
 
 
-def _picture(frame: Floats, found: dict[str, tuple[bf.SampledPSF, Floats, Floats]], folder: Path) -> str:
+def _picture(
+    frame: Floats, found: dict[str, tuple[bf.SampledPSF, Floats, Floats]], folder: Path
+) -> str:
     figure, axes = panels(1, 4)
     middle, half = len(frame) // 2, HALF_WIDTHS["Fig. 2b"]
     psf, _, error = found["Fig. 2b"]
@@ -72,9 +81,18 @@ def _picture(frame: Floats, found: dict[str, tuple[bf.SampledPSF, Floats, Floats
         vmin=0.0,
         vmax=top,
     )
-    drawn = show(axes[0, 1], psf.values, f"Fig. 5b: {OVERSAMPLING} x finer", step=1.0 / OVERSAMPLING, vmin=0.0, vmax=top)
+    drawn = show(
+        axes[0, 1],
+        psf.values,
+        f"Fig. 5b: {OVERSAMPLING} x finer",
+        step=1.0 / OVERSAMPLING,
+        vmin=0.0,
+        vmax=top,
+    )
     bar(drawn, axes[0, :2], "counts per pixel")
-    drawn = show(axes[0, 2], error, "error", step=1.0 / OVERSAMPLING, colours="RdBu_r", vmin=-0.1, vmax=0.1)
+    drawn = show(
+        axes[0, 2], error, "error", step=1.0 / OVERSAMPLING, colours="RdBu_r", vmin=-0.1, vmax=0.1
+    )
     bar(drawn, axes[0, 2], "error / peak")
     for name, (_, offsets, each) in found.items():
         row = np.abs(each[len(each) // 2])

@@ -1,9 +1,10 @@
 """Fig. 6: the polynomial and the logarithmic frame reconstructed, their residuals, V; and how many terms the logarithm needs.
 
-V is the sum over pixels of squared residuals in units of a source's flux, for frames without noise as in the paper. What is left
-of the logarithm with the paper's 12 terms has structure. More terms are tried on a frame of Poisson counts (background 5): f = x
-times, g = y times every u^2a v^2b up to a + b = K, which is the logarithm's own series with free coefficients. Leave-one-out says
-how many are worth having.
+V is the sum over pixels of squared residuals in units of a source's flux, for frames without noise
+as in the paper. What is left of the logarithm with the paper's 12 terms has structure. More terms
+are tried on a frame of Poisson counts (background 5): f = x times, g = y times every u^2a v^2b up
+to a + b = K, which is the logarithm's own series with free coefficients. Leave-one-out says how
+many are worth having.
 """
 
 from pathlib import Path
@@ -82,12 +83,23 @@ def make(quick: bool, folder: Path) -> Section:
         fits[names[order]] = fit(posterior, quick, f"log{order}", near, target_ess=400)
     compared = bf.compare({name: f.chain for name, f in fits.items() if f.chain}, draws=200)
     scores = {s.name: s for s in compared.scores}
-    rows += [Row("logarithm, 12 terms: V", "structure", f"{value_12:.2e}", True, "the paper prints no V for this frame")]
+    rows += [
+        Row(
+            "logarithm, 12 terms: V",
+            "structure",
+            f"{value_12:.2e}",
+            True,
+            "the paper prints no V for this frame",
+        )
+    ]
     residuals = {}
     for name, f in fits.items():
         assert f.chain
         posterior = f.chain.posterior()
-        residuals[name] = counts - posterior.expected_counts(f.estimate.params), posterior.sigma(f.estimate.params)
+        residuals[name] = (
+            counts - posterior.expected_counts(f.estimate.params),
+            posterior.sigma(f.estimate.params),
+        )
         s = scores[name]
         behind = f"{s.difference:.0f} ± {s.difference_se:.0f}" if s.difference else "best"
         rows.append(
@@ -96,34 +108,59 @@ def make(quick: bool, folder: Path) -> Section:
                 "",
                 behind,
                 None,
-                f"largest mean residual of 10 x 10 pixels: {structure(*residuals[name]):.1f} standard errors",
+                f"largest mean residual of 10 x 10 pixels: {structure(*residuals[name]):.1f} "
+                "standard errors",
             )
         )
     chosen = compared.chosen
-    d = paper_model(series(ORDERS[[names[k] for k in ORDERS].index(chosen)])) if chosen in names.values() else model
-    _, left_chosen, value_chosen = least_squares(d, logarithm, fits[chosen].estimate.params[: d.distortion.n_terms])
-    rows.append(Row(f"logarithm, {chosen}, which predictive accuracy chooses: V", "", f"{value_chosen:.2e}", None, "without noise"))
+    d = (
+        paper_model(series(ORDERS[[names[k] for k in ORDERS].index(chosen)]))
+        if chosen in names.values()
+        else model
+    )
+    _, left_chosen, value_chosen = least_squares(
+        d, logarithm, fits[chosen].estimate.params[: d.distortion.n_terms]
+    )
+    rows.append(
+        Row(
+            f"logarithm, {chosen}, which predictive accuracy chooses: V",
+            "",
+            f"{value_chosen:.2e}",
+            None,
+            "without noise",
+        )
+    )
     pictures = [
         _reconstructions(polynomial, left, logarithm, left_12, chosen, left_chosen, folder),
         _terms(residuals, folder),
     ]
     text = (
-        "Frames without noise for V, in units of the source flux squared. The last rows add Poisson counts and ask how many terms "
-        "the logarithm deserves: `bf.compare` of models with every x u^2a v^2b, y u^2a v^2b up to a + b = K. 10 x 10 pixels' mean "
+        "Frames without noise for V, in units of the source flux squared. The last rows add "
+        "Poisson counts and ask how many terms "
+        "the logarithm deserves: `bf.compare` of models with every x u^2a v^2b, y u^2a v^2b up to "
+        "a + b = K. 10 x 10 pixels' mean "
         "residuals of 2500 blocks reach 3.6 standard errors by chance."
     )
     return Section("Fig. 6: reconstructions", text, rows, pictures)
 
 
 def _reconstructions(
-    polynomial: Floats, left: Floats, logarithm: Floats, left_12: Floats, chosen: str, left_chosen: Floats, folder: Path
+    polynomial: Floats,
+    left: Floats,
+    logarithm: Floats,
+    left_12: Floats,
+    chosen: str,
+    left_chosen: Floats,
+    folder: Path,
 ) -> str:
     figure, axes = panels(2, 3)
     for axis, image, title in (
         (axes[0, 0], polynomial - left, "Fig. 6a: polynomial, reconstructed"),
         (axes[1, 0], logarithm - left_12, "Fig. 6c: logarithm, reconstructed"),
     ):
-        drawn = show(axis, image, title, vmin=0.0, vmax=float(max(polynomial.max(), logarithm.max())))
+        drawn = show(
+            axis, image, title, vmin=0.0, vmax=float(max(polynomial.max(), logarithm.max()))
+        )
         bar(drawn, axis, "counts per pixel")
     for axis, image, title in (
         (axes[0, 1], left, "Fig. 6b: residual, polynomial"),

@@ -1,8 +1,9 @@
 """How functions are compiled: numba, with a cache that no edit of any kernel can leave behind.
 
-numba keys what it compiled on the source file of the function alone, but machine code contains the functions of other modules
-that it calls. Here the key is a hash of every module of the package with compiled code, and of the modules from outside
-that define the named tuples among a function's arguments: the compiled halves of other PSFs and noise models.
+numba keys what it compiled on the source file of the function alone, but machine code contains the
+functions of other modules that it calls. Here the key is a hash of every module of the package with
+compiled code, and of the modules from outside that define the named tuples among a function's
+arguments: the compiled halves of other PSFs and noise models.
 """
 
 import hashlib
@@ -15,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numba as nb
-from numba.core import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.types import BaseNamedTuple, BaseTuple  # type: ignore[attr-defined]
 
 # Folders of the package with compiled code.
-FOLDERS = ("imaging/kernels", "inference/kernels")
+FOLDERS = ("imaging/kernels", "model/kernels")
 
 
 @cache
@@ -43,11 +44,11 @@ def _module_hash(module: str) -> str:
 
 def _modules(kind: Any) -> Iterator[str]:
     """Modules outside the package that define the named tuples in an argument's type."""
-    if isinstance(kind, types.BaseNamedTuple):
+    if isinstance(kind, BaseNamedTuple):
         module = kind.instance_class.__module__
         if module.split(".")[0] != __name__.split(".")[0]:
             yield module
-    if isinstance(kind, types.BaseTuple):
+    if isinstance(kind, BaseTuple):
         for part in kind:
             yield from _modules(part)
 
@@ -57,11 +58,16 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._cache_file = IndexDataCacheFile(self._cache_path, self._impl.filename_base, source_hash())
+        self._cache_file = IndexDataCacheFile(
+            self._cache_path, self._impl.filename_base, source_hash()
+        )
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         outside = sorted({module for kind in sig for module in _modules(kind)})
-        return (*super()._index_key(sig, codegen), *((module, _module_hash(module)) for module in outside))
+        return (
+            *super()._index_key(sig, codegen),
+            *((module, _module_hash(module)) for module in outside),
+        )
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.elementary import FAST, REDUCE
-from bayesfred.imaging.kernels.maps import footprints, locate, new_maps, new_work
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
+from bayesfred.imaging.kernels.geometry import footprints, locate, new_maps, new_work
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-from bayesfred.imaging.kernels.profiles import psf_bends, psf_slopes
+from bayesfred.imaging.kernels.psf_profiles import psf_bends, psf_slopes
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -19,8 +19,8 @@ Ints = npt.NDArray[np.int64]
 class Basis(NamedTuple):
     """What derivatives are made of: the unit-flux kernel's derivative with respect to single monomials of f and g.
 
-    d K / d theta_k of a source is lever[s, k] times row[k] of the basis: first the monomials u^m v^n of f,
-    then those of g, then K itself (flux), then dK/dsigma.
+    d K / d theta_k of a source is lever[s, k] times row[k] of the basis: first the monomials u^m
+    v^n of f, then those of g, then K itself (flux), then dK/dsigma.
     """
 
     f: Ints  # (., 2) powers of u and v
@@ -99,7 +99,24 @@ def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, d
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def _samples_row(psf, sigma, weight, template, ramp, t, ra, rb, rd, degree, d_degree, e, size, signed, along_a, along_b):
+def _samples_row(
+    psf,
+    sigma,
+    weight,
+    template,
+    ramp,
+    t,
+    ra,
+    rb,
+    rd,
+    degree,
+    d_degree,
+    e,
+    size,
+    signed,
+    along_a,
+    along_b,
+):
     """P |D|, s P, P_a |D| and P_b |D| of a template at u - u_peak from t on, the names being those of `basis_row`."""
     _polynomial_row(along_a, ramp, t, ra, degree)
     _polynomial_row(along_b, ramp, t, rb, degree)
@@ -150,13 +167,13 @@ def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start)
 def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, powers, work):
     """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
 
-    An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term changes
-    b, hence p by p_b B and D by B_v a_u - B_u a_v. With P = weight p and s = sign(D) the rows of `samples` are P, P |D|, s P,
-    P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u.
+    An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a
+    g-term changes b, hence p by p_b B and D by B_v a_u - B_u a_v. With P = weight p and s = sign(D)
+    the rows of `samples` are P, P |D|, s P, P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u.
 
-    Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is shifted along a and along b,
-    X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or by -p_b. The number comes as an np.int64: of a literal one
-    this function would be compiled anew.
+    Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is
+    shifted along a and along b, X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or
+    by -p_b. The number comes as an np.int64: of a literal one this function would be compiled anew.
     """
     ra, rb, rav, rbv, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5]
     ramp, conserve = o.ramp, len(o.d_degree) > 0
@@ -164,10 +181,18 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
     for k in range(out.shape[0]):
         out[k, :n] = 0.0
     order = 2.0 if template == 0 else 3.0
-    widens = basis.row.size > 0 and basis.row[-1] == n_f + n_g + 1  # the width is the last parameter, if it is one
+    widens = (
+        basis.row.size > 0 and basis.row[-1] == n_f + n_g + 1
+    )  # the width is the last parameter, if it is one
     v_row = (j - 0.5 * (o.ny - 1)) * o.step
     u_row = (low - 0.5 * (o.nx - 1)) * o.step
-    e, size, signed, along_a, along_b = samples[0, :n], samples[1, :n], samples[2, :n], samples[3, :n], samples[4, :n]
+    e, size, signed, along_a, along_b = (
+        samples[0, :n],
+        samples[1, :n],
+        samples[2, :n],
+        samples[3, :n],
+        samples[4, :n],
+    )
     f_u, f_v, g_u, g_v = samples[5, :n], samples[6, :n], samples[7, :n], samples[8, :n]
     row_k, row_s = out[n_f + n_g, :n], out[n_f + n_g + 1, :n]
     top = len(o.degree)
@@ -181,7 +206,22 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
             t = u - maps.peak[s, 0]
             weight = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
             _samples_row(
-                o.psf, sigma, weight, template, ramp, t, ra, rb, rd, o.degree, o.d_degree, e, size, signed, along_a, along_b
+                o.psf,
+                sigma,
+                weight,
+                template,
+                ramp,
+                t,
+                ra,
+                rb,
+                rd,
+                o.degree,
+                o.d_degree,
+                e,
+                size,
+                signed,
+                along_a,
+                along_b,
             )
             if conserve:
                 _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
@@ -196,7 +236,9 @@ def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, power
                 samples[5:] = 0.0
             _add_row_of(row_k, size)
             if widens:
-                _add_widening(row_s, size, order, along_a, along_b, sigma, ramp, t, ra, rb, o.degree)
+                _add_widening(
+                    row_s, size, order, along_a, along_b, sigma, ramp, t, ra, rb, o.degree
+                )
             _powers_row(powers, ramp, u, n)
             _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
             _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
@@ -276,9 +318,10 @@ def _add_sums(basis_powers, along, first, second, out):
 def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples, sums, work):
     """Add to out[k] the sum over a source's pixels of weight times row k of the basis, see `basis_row`.
 
-    About the source's peak a_u, a_v, b_u and b_v are polynomials in t and w. So the sums follow, however many monomials there
-    are, from those over t^m w^n times A = weight P_a |D|, B = weight P_b |D| and E = weight s P: `sums`, which holds beside them
-    what `_multiply_out` makes of the last.
+    About the source's peak a_u, a_v, b_u and b_v are polynomials in t and w. So the sums follow,
+    however many monomials there are, from those over t^m w^n times A = weight P_a |D|, B = weight
+    P_b |D| and E = weight s P: `sums`, which holds beside them what `_multiply_out` makes of the
+    last.
     """
     top, rows = len(o.degree), range(fp.first[s], fp.first[s + 1])
     n_f, n_g = basis.f.shape[0], basis.g.shape[0]
@@ -302,7 +345,22 @@ def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples,
                 t = (fp.low[r] - 0.5 * (o.nx - 1)) * o.step + offsets[p] - h
                 norm = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
                 _samples_row(
-                    o.psf, sigma, norm, template, ramp, t, ra, rb, rd, o.degree, o.d_degree, e, size, signed, along_a, along_b
+                    o.psf,
+                    sigma,
+                    norm,
+                    template,
+                    ramp,
+                    t,
+                    ra,
+                    rb,
+                    rd,
+                    o.degree,
+                    o.d_degree,
+                    e,
+                    size,
+                    signed,
+                    along_a,
+                    along_b,
                 )
                 flux += _weigh_row(own, size, along_a, along_b, signed)
                 power[:] = 1.0

@@ -1,11 +1,12 @@
 """Polynomials in two variables as matrices of coefficients: evaluated, shifted, multiplied out, cut along a row of pixels.
 
-On a row of pixels they are polynomials in u alone. Their degree reaches the innermost loop as the length of a tuple, that is as a
-compile-time constant, so that the loop over pixels vectorises for every degree.
+On a row of pixels they are polynomials in u alone. Their degree reaches the innermost loop as the
+length of a tuple, that is as a compile-time constant, so that the loop over pixels vectorises for
+every degree.
 """
 
 from bayesfred.imaging.kernels.compilation import inner
-from bayesfred.imaging.kernels.elementary import FAST
+from bayesfred.imaging.kernels.fastmath import FAST
 
 
 @inner(fastmath={"contract"})

@@ -1,0 +1,427 @@
+"""How well a distortion can be known: fits of simulated frames at several noise levels, against the Cramer-Rao bound."""
+
+import itertools
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from bayesfred.analysis.executor import Executor, run
+from bayesfred.analysis.study_helpers import (
+    LEVELS,
+    Method,
+    check,
+    coverage_error,
+    covered,
+    draws,
+    given,
+    maximum,
+    seeds,
+)
+from bayesfred.errors import InputError
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize.find_map import inverse
+from bayesfred.optimize.fit_statistics import fit_statistics
+from bayesfred.sampling.chainfile import fingerprint
+
+Floats = npt.NDArray[np.float64]
+
+__all__ = ["NoiseStudy", "noise_study"]
+
+VARIABLES = ("background", "flux", "sources", "psf_sigma", "exposure")
+MOST_CELLS = 10_000
+ESS = 1000  # effective draws of every posterior
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """The tasks of a noise study: every replicate of every cell, one replicate of all cells after the other."""
+
+    model: ForwardModel
+    theta: tuple[float, ...]
+    cells: tuple[dict[str, float], ...]
+    method: Method
+    noise: PoissonNoise | BackgroundNoise
+    nuisances: Nuisances
+    prior: Mapping[str, Any] | None
+    mask: npt.NDArray[np.bool_] | None
+    seed: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.model.distortion.names, "background", *self.nuisances.names)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        each = (
+            f"{name}.{what}"
+            for name in self.names
+            for what in ("truth", "estimate", "sd", "bound", "pit")
+        )
+        return ("replicate", *VARIABLES, "chi2", "lambda", "deviance", "theta.distance", *each)
+
+    def contents(self) -> dict[str, str]:
+        posterior, _ = self.cell(0)
+        return {
+            **fingerprint(posterior),
+            "grid": repr(self.cells),
+            "method": self.method,
+            "seed": str(self.seed),
+        }
+
+    def cell(self, j: int) -> tuple[Posterior, Floats]:
+        """The posterior of a frame without noise, and the true parameters."""
+        c = self.cells[j]
+        s = self.model.sources
+        kept = _spread(s, round(c["sources"]))
+        flux = s.flux[kept] * (c["flux"] / s.flux.mean() * c["exposure"])
+        psf = self.model.psf
+        if isinstance(psf, GaussianPSF):
+            psf = replace(psf, sigma=c["psf_sigma"])
+        model = replace(self.model, sources=SourceCatalog(s.x[kept], s.y[kept], flux), psf=psf)
+        level = c["background"] * c["exposure"]
+        frame = model.expected_counts(self.theta, level)
+        posterior = Posterior(
+            model,
+            frame,
+            prior=self.prior,
+            noise=self.noise,
+            mask=self.mask,
+            nuisances=self.nuisances,
+        )
+        known = {"background": level, "flux_scale": 1.0, "psf_sigma": psf.sigma}
+        return posterior, np.array(
+            [*self.theta, *(known.get(name, 0.0) for name in self.names[len(self.theta) :])]
+        )
+
+    def task(self, k: int) -> Sequence[float]:
+        replicate, j = divmod(k, len(self.cells))
+        template, truth = self.cell(j)
+        for_frame, for_draws = seeds(self.seed, k).spawn(2)
+        level = float(truth[len(self.theta)])
+        counts = self.noise.draw(
+            template.model.expected_counts(self.theta), level, np.random.default_rng(for_frame)
+        )
+        posterior = given(template, counts)
+        estimate = maximum(posterior)
+        if self.method == "mcmc":
+            drawn = draws(posterior, estimate, self.method, for_draws, ESS)
+            middle, sd, pit = (
+                drawn.mean(axis=0),
+                drawn.std(axis=0, ddof=1),
+                (drawn < truth).mean(axis=0),
+            )
+        else:
+            middle, sd = estimate.params, np.sqrt(np.diag(estimate.covariance))
+            pit = ndtr((truth - middle) / sd)
+        bound = inverse(posterior.fisher(truth))
+        d = len(self.theta)
+        off = (middle - truth)[:d]
+        fit = fit_statistics(posterior, middle)
+        deviance = (fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"]
+        each = np.stack([truth, middle, sd, np.sqrt(np.diag(bound)), pit], axis=1)
+        distance = off @ np.linalg.solve(bound[:d, :d], off)
+        cell = (self.cells[j][name] for name in VARIABLES)
+        return (
+            replicate,
+            *cell,
+            fit["chi2_paper"],
+            fit["background_estimate"],
+            deviance,
+            distance,
+            *each.ravel(),
+        )
+
+
+def _spread(sources: SourceCatalog, n: int) -> npt.NDArray[np.intp]:
+    """The n brightest sources; among equally bright ones each is the farthest from those before it."""
+    if n == len(sources):
+        return np.arange(n)
+    apart = np.full(n_all := len(sources), np.inf)
+    chosen = np.zeros(n_all, bool)
+    for _ in range(n):
+        free = np.flatnonzero(~chosen)
+        brightest = free[sources.flux[free] == sources.flux[free].max()]
+        s = brightest[np.argmax(apart[brightest])]
+        chosen[s] = True
+        apart = np.minimum(apart, np.hypot(sources.x - sources.x[s], sources.y - sources.y[s]))
+    return np.flatnonzero(chosen)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseStudy:
+    """What a noise study found.
+
+    Attributes
+    ----------
+    path : Path
+        The table with a row for every frame.
+    parameter_names : tuple of str
+    replicates : dict of str to ndarray
+        That table: `task`, `replicate`, the cell's variables, chi2, lambda, the deviance in
+        standard deviations, the distance of theta from its truth in the metric of the bound,
+        squared; and for every parameter its truth, estimate, sd, bound and PIT (the posterior
+        probability of values below the truth); `message` says why a frame has no numbers.
+    cells : dict of str to ndarray
+        A row for every cell and parameter, and one for theta as a whole: see `noise_study`.
+    message : str
+        One line: frames, failures, efficiency, coverage.
+    """
+
+    path: Path
+    parameter_names: tuple[str, ...]
+    replicates: dict[str, npt.NDArray[Any]]
+    cells: dict[str, npt.NDArray[Any]]
+    message: str
+
+
+def noise_study(
+    model: ForwardModel,
+    theta: npt.ArrayLike,
+    background: float | Sequence[float],
+    *,
+    flux: Sequence[float] = (),
+    sources: Sequence[int] = (),
+    psf_sigma: Sequence[float] = (),
+    exposure: Sequence[float] = (),
+    replicates: int = 50,
+    method: Method = "laplace",
+    noise: PoissonNoise | BackgroundNoise = PoissonNoise(),
+    nuisances: Nuisances = Nuisances(),
+    prior: Mapping[str, Any] | None = None,
+    mask: npt.ArrayLike | None = None,
+    path: str | os.PathLike[str],
+    seed: int,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> NoiseStudy:
+    """Fit many simulated frames at every cell of a grid of noise levels.
+
+    Every row of `NoiseStudy.cells` has the cell's variables; the number of frames that were fitted
+    and that failed; the mean chi2 (the paper's) and lambda (its estimate of the background, counts
+    per pixel); and of one parameter: truth, width (mean posterior sd), bias (mean estimate less
+    truth), scatter (sd of the estimates), bound (Cramer-Rao, as an sd; without the prior),
+    efficiency (bound^2 / scatter^2), coverage_68 and coverage_95, the shares of frames whose
+    central intervals hold the truth. `_error` is the Monte Carlo error. In the row `theta`,
+    efficiency is the number of coefficients over their mean squared distance from the truth in the
+    metric of the bound, and coverage the mean of theirs.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    theta : array_like, shape (n_terms,)
+        The true coefficients. Nuisances have their neutral values.
+    background : float or sequence of float, counts per pixel
+    flux : sequence of float, counts
+        Mean flux of the sources; without it, and without those below, as in the model.
+    sources : sequence of int
+        Numbers of sources: the brightest, and of equally bright ones those that lie farthest apart.
+    psf_sigma : sequence of float, pixel
+    exposure : sequence of float
+        Factors of flux and background together.
+    replicates : int
+        Frames of every cell.
+    method : {"laplace", "mcmc"}
+        Maximum and Fisher information alone, or draws.
+    noise, nuisances, prior, mask
+        As of `Posterior`. Default priors are those of the cell's frame without noise.
+    path : path-like
+        The table, .ecsv, that keeps every frame's numbers as they come.
+    seed : int
+        The same seed gives the same numbers, whoever computes them.
+    executor : object with submit(function, *args), optional
+        A `concurrent.futures.Executor`, a Dask client's `get_executor()`, an
+        `mpi4py.futures.MPIPoolExecutor`; by default a pool of fresh processes, for which a script
+        needs `if __name__ == "__main__":`.
+    workers : int, optional
+        Processes of that pool, by default one a core; 1 is this process alone.
+    resume : bool
+        Go on with the study in the file; more replicates may be asked for.
+    overwrite : bool
+        Replace the file.
+    progress : bool
+        Show a progress bar on standard error.
+
+    Returns
+    -------
+    NoiseStudy
+
+    Raises
+    ------
+    InputError
+        If a cell cannot be simulated, the file exists or holds another study, or a worker dies.
+    KeyboardInterrupt
+        After every finished frame was kept.
+
+    References
+    ----------
+    Sun & Zhou, Section 4.2.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((41, 41)), bf.SourceCatalog.grid(3, 12.0, 1e3), bf.GaussianPSF(2.0),
+    ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     study = noise_study(
+    ...         model, [1e-3], [0.5, 50.0], replicates=2, path=f"{folder}/noise.ecsv", seed=1, workers=1, progress=False)
+    >>> rows = study.cells["parameter"] == "f_ux"
+    >>> study.cells["background"][rows].tolist(), bool(np.diff(study.cells["bound"][rows]) > 0)
+    ([0.5, 50.0], True)
+    """
+    check("noise study", replicates, method)
+    if nuisances.position_scatter:
+        raise InputError(
+            "noise study: got position_scatter, expected sources at their places: fit without, or "
+            "calibrate instead"
+        )
+    if psf_sigma and not isinstance(model.psf, GaussianPSF):
+        raise InputError(
+            "noise study: psf_sigma: got widths, expected none: only a Gaussian PSF's width is "
+            "varied"
+        )
+    given: dict[str, Sequence[float]] = {
+        "background": np.atleast_1d(background).tolist(),
+        "flux": flux or [float(model.sources.flux.mean())],
+        "sources": sources or [len(model.sources)],
+        "psf_sigma": psf_sigma or [model.psf.sigma],
+        "exposure": exposure or [1.0],
+    }
+    for name, values in given.items():
+        for value in values:
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"noise study: {name}: got {value}, expected a number > 0")
+    wrong = [n for n in given["sources"] if n != round(n) or n > len(model.sources)]
+    if wrong:
+        raise InputError(
+            f"noise study: sources: got {wrong[0]}, expected a number from 1 to the catalogue's "
+            f"{len(model.sources)}"
+        )
+    number = math.prod(map(len, given.values()))
+    if number > MOST_CELLS:
+        raise InputError(
+            f"noise study: got {number} combinations of noise levels, expected at most "
+            f"{MOST_CELLS}: shorten the lists"
+        )
+    cells = tuple(
+        dict(zip(VARIABLES, map(float, cell), strict=True))
+        for cell in itertools.product(*given.values())
+    )
+    true = tuple(np.asarray(theta, dtype=np.float64).ravel().tolist())
+    used = None if mask is None else np.array(mask, dtype=bool)
+    study = _Levels(model, true, cells, method, noise, nuisances, prior, used, seed)
+    for j in range(len(cells)):  # what cannot be simulated is said before the work
+        posterior, truth = study.cell(j)
+        if not np.isfinite(posterior.log_prob(truth)):
+            raise InputError(
+                "noise study: theta: got a distortion without prior density or that folds a "
+                "source, expected a weaker one"
+            )
+    meta = {"study": "noise", "seed": seed, "method": method, "replicates": replicates}
+    record = run(
+        study, replicates * len(cells), path=path, meta=meta, executor=executor, workers=workers, resume=resume,
+        overwrite=overwrite, progress=progress,
+    )  # fmt: skip
+    rows = record.columns
+    summary = _cells(study, rows)
+    whole = (summary["parameter"] == "theta") & (summary["frames"] > 1)
+    message = (
+        f"{rows['task'].size} frames, "
+        f"{summary['failed'][summary['parameter'] == 'theta'].sum()} failed"
+    )
+    if whole.any():
+        efficiency, coverage = summary["efficiency"][whole], summary["coverage_68"][whole]
+        message += (
+            f"; efficiency {efficiency.min():.2f} to {efficiency.max():.2f} of the Cramer-Rao bound"
+        )
+        message += f", 68 % intervals hold {coverage.min():.1%} to {coverage.max():.1%}"
+    return NoiseStudy(Path(path), study.names, rows, summary, message)
+
+
+def _cells(study: _Levels, rows: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Every cell and parameter: what its frames say together."""
+    table: list[dict[str, Any]] = []
+    cell = rows["task"] % len(study.cells)
+    good = rows["message"] == ""
+    names, d = study.names, len(study.theta)
+    for j, variables in enumerate(study.cells):
+        mine = (cell == j) & good
+        n = int(mine.sum())
+        head: dict[str, Any] = {
+            **variables,
+            "frames": n,
+            "failed": int(((cell == j) & ~good).sum()),
+        }
+        for key in ("chi2", "lambda"):
+            head[key], head[f"{key}_error"] = _mean(
+                rows[key][mine][np.isfinite(rows[key][mine])]
+            )  # chi2 needs lambda > 0
+        unknown = dict.fromkeys(
+            ("truth", "width", "bias", "bias_error", "scatter", "bound"), math.nan
+        )
+        efficiency = d / _mean(rows["theta.distance"][mine])[0]
+        every = np.stack([rows[f"{term}.pit"][mine] for term in names[:d]], axis=1)
+        whole = {
+            "efficiency": efficiency,
+            "efficiency_error": efficiency * math.sqrt(2.0 / max(n * d, 1)),
+        }
+        table.append({**head, "parameter": "theta", **unknown, **whole, **_coverage(every)})
+        for name in names:
+            truth, estimate, sd, bound, pit = (
+                rows[f"{name}.{w}"][mine] for w in ("truth", "estimate", "sd", "bound", "pit")
+            )
+            bias, error = _mean(estimate - truth)
+            scatter, least = error * math.sqrt(n), math.sqrt(_mean(bound**2)[0])
+            efficiency = least**2 / scatter**2
+            own = {
+                "truth": _mean(truth)[0],
+                "width": _mean(sd)[0],
+                "bias": bias,
+                "bias_error": error,
+                "scatter": scatter,
+            }
+            own |= {
+                "bound": least,
+                "efficiency": efficiency,
+                "efficiency_error": efficiency * math.sqrt(2.0 / max(n - 1, 1)),
+            }
+            table.append({**head, "parameter": name, **own, **_coverage(pit[:, None])})
+    return {key: np.array([row[key] for row in table]) for key in table[0]}
+
+
+def _mean(values: Floats) -> tuple[float, float]:
+    """Mean and its error; NaN of fewer than two values."""
+    n = values.size
+    return (
+        (float(values.mean()), float(values.std(ddof=1)) / math.sqrt(n))
+        if n > 1
+        else (math.nan, math.nan)
+    )
+
+
+def _coverage(pit: Floats) -> dict[str, float]:
+    """Share of the intervals that hold the truth, and its error; those of one frame, a row, are not independent."""
+    out: dict[str, float] = {}
+    for level in LEVELS:
+        share, among = _mean(covered(pit, level).mean(axis=1))
+        key = f"coverage_{100 * level:.0f}"
+        out |= {
+            key: share,
+            f"{key}_error": among if pit.shape[1] > 1 else coverage_error(level, len(pit)),
+        }
+    return out

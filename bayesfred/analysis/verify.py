@@ -1,0 +1,154 @@
+"""Whether a chain file is what it says it is: what can be computed again is, and compared.
+
+On the machine and with the packages that made a run, everything comes out bit for bit. Others round
+differently in the last digits, so a check allows for that much, and says how far off it was.
+"""
+
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_triangular
+from threadpoolctl import threadpool_limits
+
+from bayesfred.errors import InputError
+from bayesfred.io.hdf5_checks import stated_digest
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.find_map import find_map
+from bayesfred.sampling.chainfile import Chain, changed_parts, fingerprint, open_chain
+from bayesfred.sampling.ensembles import advance, begin
+from bayesfred.sampling.moves import LaplaceMove
+
+Floats = npt.NDArray[np.float64]
+
+DRAWS = 1000  # whose log-probability is computed again, unless all are
+STEPS = 10  # made again from the seed
+ROUNDING = 1e-6  # of a log-probability, and of a draw in standard deviations
+NEAR = 0.01  # standard deviations between the stored maximum and the one found from it
+
+
+class Check(NamedTuple):
+    """One thing that was checked."""
+
+    what: str
+    finding: str
+    holds: bool
+
+
+def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
+    """Compute again what a chain file holds.
+
+    Parameters
+    ----------
+    path : Path
+    every_draw : bool
+        Compute the log-probability of every draw, not of 1,000 evenly spaced ones.
+
+    Returns
+    -------
+    list of Check
+
+    Raises
+    ------
+    InputError
+        If the file is refused before anything can be computed, see `open_chain`.
+    """
+    chain = open_chain(path)
+    posterior = chain.posterior()
+    near = posterior.near(chain.estimate.params, chain.estimate.covariance)  # as in the run
+    return [
+        Check("file", f"SHA-256 {stated_digest(path)}", True),  # it has been opened
+        _posterior(path, posterior),
+        _log_prob(chain, near, every_draw),
+        *_maximum(chain, posterior),
+        *_steps(chain, near),
+    ]
+
+
+def _posterior(path: Path, posterior: Posterior) -> Check:
+    changed = changed_parts(path, posterior)
+    if changed:
+        return Check("posterior", f"differs when rebuilt: {', '.join(changed)}", False)
+    parts = ", ".join(f"{name} {digest[:8]}" for name, digest in fingerprint(posterior).items())
+    return Check("posterior", f"rebuilt with the same hashes: {parts}", True)
+
+
+def _log_prob(chain: Chain, posterior: Posterior, every_draw: bool) -> Check:
+    draws, stored = chain.chain.reshape(-1, posterior.n_parameters), chain.log_prob.ravel()
+    n = stored.size if every_draw else min(DRAWS, stored.size)
+    chosen = np.linspace(0, stored.size - 1, n).astype(int)
+    again = np.concatenate(
+        [posterior.log_prob(draws[part]) for part in np.array_split(chosen, -(-n // DRAWS))]
+    )
+    off, share = _farthest(again, stored[chosen])
+    return Check(
+        "log-probability", f"{n} of {stored.size} draws: differ by at most {off:.2g}", share <= 1.0
+    )
+
+
+def _farthest(a: Floats, b: Floats) -> tuple[float, float]:
+    """The largest difference of two sets of log-probabilities, and how much of what rounding may do it is."""
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return np.inf, np.inf
+    off = np.abs(a - b)
+    return float(off.max()), float((off / (ROUNDING + 1e-12 * np.abs(a))).max())
+
+
+def _maximum(chain: Chain, posterior: Posterior) -> list[Check]:
+    stored = chain.estimate
+    off, share = _farthest(
+        np.array([posterior.log_prob(stored.params)]), np.array([stored.log_prob])
+    )
+    value = Check("MAP's log-probability", f"differs by {off:.2g}", share <= 1.0)
+    if not stored.at_maximum:
+        return [value, Check("MAP", "was stored as not at the maximum", True)]
+    try:
+        again = find_map(posterior, stored.params)
+        lower = LaplaceMove(again.params, again.covariance).lowers[0]
+    except InputError as error:
+        return [value, Check("MAP", str(error), False)]
+    distance = float(
+        np.linalg.norm(solve_triangular(lower, stored.params - again.params, lower=True))
+    )
+    sd = np.sqrt(np.diag(again.covariance))
+    excess = float(np.abs((stored.covariance - again.covariance) / np.outer(sd, sd)).max())
+    return [
+        value,
+        Check("MAP", f"found again, {distance:.1g} standard deviations away", distance <= NEAR),
+        Check("covariance", f"found again, correlations within {excess:.1g}", excess <= NEAR),
+    ]
+
+
+def _steps(chain: Chain, posterior: Posterior) -> list[Check]:
+    """The first steps made again, and the numbers of accepted moves, for which the first step is needed."""
+    ensembles, n_steps, walkers = chain.log_prob.shape
+    try:
+        start = begin(posterior, chain.estimate, chain.seed, ensembles, walkers)
+        with threadpool_limits(1, user_api="blas"):
+            steps = list(islice(advance(posterior, chain.estimate, start), min(STEPS, n_steps)))
+    except InputError as error:
+        return [Check("first steps", str(error), False)]
+    again, stored = np.stack([s.coords for s in steps], axis=1), chain.chain[:, : len(steps)]
+    off = np.abs(again - stored) / np.sqrt(np.diag(chain.estimate.covariance))
+    wrong = np.flatnonzero(~(off.max(axis=(0, 2, 3)) <= ROUNDING))
+    finding = f"{len(steps)} made again from seed {chain.seed}: "
+    if wrong.size:
+        finding += f"differ from step {wrong[0] + 1} on"
+    elif np.array_equal(again, stored):
+        finding += "equal bit for bit"
+    else:
+        finding += f"differ by at most {off.max():.1g} standard deviations"
+    moved = steps[0].accepted + np.any(np.diff(chain.chain, axis=1) != 0.0, axis=3).sum(axis=1)
+    counted = (
+        f"{n_steps} steps of {ensembles} x {walkers} walkers, {chain.accepted.sum()} moves accepted"
+    )
+    return [
+        Check("first steps", finding, not wrong.size),
+        Check(
+            "numbers",
+            f"{counted}, {moved.sum()} counted again",
+            np.array_equal(moved, chain.accepted),
+        ),
+    ]

@@ -1,0 +1,132 @@
+"""What is imaged: a catalogue of point sources with known positions and fluxes.
+
+Positions are object-plane coordinates in pixels of the fine grid, from the middle of the frame: x
+along columns, y along rows. `forward` turns a catalogue and a distortion into expected counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesfred.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SourceCatalog:
+    """Point sources; the arrays are copied, converted to float64 and made read-only.
+
+    Attributes
+    ----------
+    x, y : ndarray, shape (n_sources,), pixel
+        Positions in the object plane from the middle of the frame. They may lie outside the frame.
+    flux : ndarray, shape (n_sources,), photons
+        Expected photons of each source over the whole plane, > 0 and at most 2**53: float64 counts
+        no further.
+
+    Raises
+    ------
+    InputError
+        If an array is not one-dimensional, is empty or not finite, if their lengths differ, or if a
+        flux is not > 0 or more than 2**53.
+
+    Examples
+    --------
+    >>> len(SourceCatalog(x=[0.0, 30.0], y=[0.0, -20.0], flux=[1e4, 2e4]))
+    2
+    """
+
+    x: FloatArray
+    y: FloatArray
+    flux: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "flux"):
+            object.__setattr__(self, name, _column(name, getattr(self, name)))
+        if not len(self.x) == len(self.y) == len(self.flux):
+            raise InputError(
+                f"x, y, flux: got {len(self.x)}, {len(self.y)} and {len(self.flux)} values, "
+                "expected one of each for every source"
+            )
+        good = (self.flux > 0.0) & (self.flux <= 2.0**53)
+        if not good.all():
+            first = int(np.argmin(good))
+            raise InputError(
+                f"flux: got {self.flux[first]:g} for source {first}, expected > 0 and at most "
+                "9e15: remove it or mend it"
+            )
+
+    @classmethod
+    def grid(cls, side: int, spacing: float, flux: float) -> Self:
+        """Lay out a square array of equal sources centred on the axis, row by row (the paper's object: 9, 50, 1e5).
+
+        Parameters
+        ----------
+        side : int
+            Sources along each side.
+        spacing : float, pixel
+            Distance between neighbours.
+        flux : float, photons
+            Flux of every source.
+
+        Raises
+        ------
+        InputError
+            If `side` is not an integer >= 1, or `spacing` or `flux` is not a finite number > 0.
+
+        References
+        ----------
+        Sun & Zhou, Fig. 1.
+
+        Examples
+        --------
+        >>> SourceCatalog.grid(side=2, spacing=50.0, flux=1e5).x.tolist()
+        [-25.0, 25.0, -25.0, 25.0]
+        """
+        if not isinstance(side, int | np.integer) or side < 1:
+            raise InputError(f"side: got {side!r}, expected an integer of at least 1")
+        if not (np.isfinite(spacing) and spacing > 0.0):
+            raise InputError(f"spacing: got {spacing!r}, expected a finite number of pixels > 0")
+        axis = (np.arange(side) - (side - 1) / 2.0) * spacing
+        y, x = np.meshgrid(axis, axis, indexing="ij")
+        return cls(x.ravel(), y.ravel(), np.full(x.size, flux))
+
+    def __len__(self) -> int:
+        """Count the sources."""
+        return len(self.x)
+
+    def write(self, group: Any) -> None:
+        """Store the catalogue in an HDF5 group: float64 datasets `x`, `y` and `flux`."""
+        for name in ("x", "y", "flux"):
+            group[name] = getattr(self, name)
+
+    @classmethod
+    def read(cls, group: Any) -> Self:
+        """Rebuild what `write` stored; InputError if the stored columns are not a valid catalogue."""
+        return cls(*(np.asarray(group[name]) for name in ("x", "y", "flux")))
+
+
+def _column(name: str, values: object) -> FloatArray:
+    """Make a read-only float64 copy of one column, or raise an InputError that names it."""
+    try:
+        column = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{name}: got values that are not numbers, expected one number a source"
+        ) from None
+    if column.ndim != 1 or column.size == 0:
+        raise InputError(
+            f"{name}: got shape {column.shape}, expected one dimension and at least one source"
+        )
+    if not np.isfinite(column).all():
+        first = int(np.argmin(np.isfinite(column)))
+        raise InputError(
+            f"{name}: got {column[first]} for source {first}, expected a finite number"
+        )
+    column.setflags(write=False)
+    return column

@@ -1,0 +1,70 @@
+"""One writer a chain file: a lock that says who holds it.
+
+The lock is the operating system's, which frees it when its holder dies. Who holds it stands in a
+file beside it, because not every version of filelock leaves the content of the lock file alone.
+"""
+
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+
+import filelock
+
+from bayesfred.errors import InputError
+
+PATIENCE = 0.1  # seconds; a writer that was killed holds nothing, so there is nothing to wait for
+
+
+@contextmanager
+def only_writer(path: Path) -> Iterator[None]:
+    """Be the only writer of a chain file.
+
+    Parameters
+    ----------
+    path : Path
+        The chain file, which need not exist yet.
+
+    Raises
+    ------
+    InputError
+        If another process writes it, which is named, or its folder cannot be written.
+    """
+    lock, holder = (
+        filelock.FileLock(path.with_name(f".{path.name}.lock"), PATIENCE),
+        path.with_name(f".{path.name}.writer"),
+    )
+    try:
+        lock.acquire()
+        since = datetime.now().astimezone().isoformat(" ", "seconds")
+        holder.unlink(missing_ok=True)
+        with open(holder, "x", encoding="utf-8") as stream:  # never through a link
+            stream.write(f"process {os.getpid()} on {socket.gethostname()} since {since}")
+    except filelock.Timeout:
+        raise InputError(
+            f"{path}: another process is writing this chain{_told(holder)}, expected to be the "
+            "only one: wait for it, or stop it"
+        ) from None
+    except OSError as error:
+        lock.release()
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}), expected a folder that can be"
+        ) from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            holder.unlink(missing_ok=True)
+        lock.release()
+
+
+def _told(holder: Path) -> str:
+    """What the holder says of itself, in a form that can be shown."""
+    try:
+        with open(holder, encoding="utf-8", errors="replace") as stream:
+            text = stream.read(200)
+    except OSError:
+        return ""
+    return f" ({''.join(c for c in text if c.isprintable())})"

@@ -1,0 +1,59 @@
+"""Where free fluxes have their maximum, extrapolated from one parameter vector and how they change around it.
+
+The most likely fluxes are a smooth function of the other parameters. Within a posterior's width it
+is nearly linear: what its secants leave is little enough for one Newton step, see
+`kernels/extrapolated.py`.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg
+
+from bayesfred.model.kernels.clusters import Clusters
+from bayesfred.model.kernels.extrapolate import Extrapolated, describe
+from bayesfred.model.kernels.fluxes import Fitted
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+class FluxExtrapolation(NamedTuple):
+    """Most likely fluxes as a linear function of the parameters, and what is known of their Hessian H."""
+
+    params: Floats  # (d,)
+    fluxes: Floats  # (s,) there
+    slope: Floats  # (s, d)
+    clusters: Clusters
+    hessian: tuple[Ints, Ints, Ints, Ints, Ints, Floats]  # see `Extrapolated`
+
+    def at(self, vectors: Floats) -> Extrapolated:
+        """For parameter vectors of shape (n, d)."""
+        return Extrapolated(
+            self.fluxes + (vectors - self.params) @ self.slope.T, self.clusters, *self.hessian
+        )
+
+
+def flux_extrapolation(
+    fluxes_at: Callable[[Floats], Floats],
+    fitted: Fitted,
+    z: Floats,
+    params: Floats,
+    covariance: Floats,
+) -> FluxExtrapolation | None:
+    """From the fluxes at `params` and a standard deviation to either side along every whitened axis; None without a covariance.
+
+    Along axes on which there are none, because the map folds or the background ends, they are taken
+    for constant. z is that of `kernels/gradient.py`.
+    """
+    try:
+        axes = linalg.cholesky(covariance, lower=True)
+    except (ValueError, linalg.LinAlgError):
+        return None
+    change = np.stack(
+        [0.5 * (fluxes_at(params + axis) - fluxes_at(params - axis)) for axis in axes.T], axis=1
+    )
+    slope = linalg.solve_triangular(axes, np.nan_to_num(change).T, trans="T", lower=True).T
+    return FluxExtrapolation(params, fitted.fluxes, slope, fitted.clusters, describe(fitted, z))

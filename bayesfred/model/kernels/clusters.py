@@ -1,0 +1,274 @@
+"""Clusters of touching footprints, and the linear algebra of their matrices.
+
+The matrix H of `fluxes.py` couples only sources whose footprints share pixels, so everything is
+done cluster by cluster.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.fastmath import REDUCE
+
+Ints = npt.NDArray[np.int64]
+
+
+class Clusters(NamedTuple):
+    """Groups of sources whose footprints share pixels: group c holds members[first[c]:first[c + 1]], from top to bottom.
+
+    A group's symmetric matrices, a row for each template of each member, are stored row after row
+    from the first member that shares pixels with the row's own up to the diagonal. What is left out
+    stays zero in Cholesky's factor.
+    """
+
+    members: Ints
+    first: Ints
+    lead: Ints  # column at which a row's storage begins, counted within the group
+    start: Ints  # where a row's column 0 would be in the group's storage
+    begin: Ints  # where the group's storage begins in a flat array
+
+
+@inner()
+def bounding_boxes(fp):
+    """First row, last row + 1, first column, last column + 1 of every footprint."""
+    size = fp.first.size - 1
+    boxes = np.zeros((size, 4), np.int64)
+    for s in range(size):
+        a, b = fp.first[s], fp.first[s + 1]
+        if b > a:
+            boxes[s, 0], boxes[s, 1], boxes[s, 2] = fp.row[a], fp.row[b - 1] + 1, fp.low[a]
+            for i in range(a, b):
+                boxes[s, 2] = min(boxes[s, 2], fp.low[i])
+                boxes[s, 3] = max(boxes[s, 3], fp.low[i] + fp.size[i])
+    return boxes
+
+
+@inner()
+def _group(keys, size):
+    """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
+    first = np.zeros(size + 2, np.int64)
+    for i in range(keys.size):
+        first[keys[i] + 2] += 1
+    for k in range(size):
+        first[k + 1] += first[k]
+    order = np.empty(keys.size, np.int64)
+    for i in range(
+        keys.size
+    ):  # after which first[k + 1] has moved from the beginning of key k to its end
+        order[first[keys[i] + 1]] = i
+        first[keys[i] + 1] += 1
+    return order, first[:-1]
+
+
+@inner()
+def find_clusters(boxes, ny, templates):
+    """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
+    size = boxes.shape[0]
+    parent, reach = np.arange(size), np.arange(size)
+    order = _group(boxes[:, 0], ny)[0]
+    for i in range(size):
+        s = order[i]
+        for k in range(i + 1, size):
+            t = order[k]
+            if boxes[t, 0] >= boxes[s, 1]:
+                break
+            if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
+                reach[k] = min(reach[k], i)
+                p, q = s, t
+                while parent[p] != p:
+                    parent[p] = parent[parent[p]]
+                    p = parent[p]
+                while parent[q] != q:
+                    parent[q] = parent[parent[q]]
+                    q = parent[q]
+                parent[max(p, q)] = min(p, q)
+    label = np.empty(size, np.int64)
+    groups = 0
+    for s in range(size):  # a root is the smallest of its group, so it is labelled first
+        p = s
+        while parent[p] != p:
+            p = parent[p]
+        if p == s:
+            label[s] = groups
+            groups += 1
+        else:
+            label[s] = label[p]
+    place, first = _group(label[order], groups)
+    within = np.empty(size, np.int64)  # how many of a group come before each in the order
+    for c in range(groups):
+        for i in range(first[c], first[c + 1]):
+            within[place[i]] = i - first[c]
+    lead, start, begin = (
+        np.empty(size * templates, np.int64),
+        np.empty(size * templates, np.int64),
+        np.zeros(groups + 1, np.int64),
+    )
+    for c in range(groups):
+        total = 0
+        for i in range(first[c], first[c + 1]):
+            column = within[reach[place[i]]] * templates
+            for t in range(templates):
+                row = i * templates + t
+                lead[row] = column
+                start[row] = total - column
+                total += (i - first[c]) * templates + t + 1 - column
+        begin[c + 1] = begin[c] + total
+    return Clusters(order[place], first, lead, start, begin)
+
+
+@inner()
+def one_cluster(clusters, c, templates):
+    """A group's members, and lead and start of its rows."""
+    a, b = clusters.first[c], clusters.first[c + 1]
+    rows = slice(a * templates, b * templates)
+    return clusters.members[a:b], clusters.lead[rows], clusters.start[rows]
+
+
+@inner()
+def touch(boxes, s, t):
+    """Whether two footprints may share pixels."""
+    apart = (
+        boxes[t, 2] >= boxes[s, 3]
+        or boxes[s, 2] >= boxes[t, 3]
+        or boxes[t, 0] >= boxes[s, 1]
+        or boxes[s, 0] >= boxes[t, 1]
+    )
+    return not apart
+
+
+@inner()
+def run_end(fp, s, i, at):
+    """The first of a source's rows after row i that does not follow the one before it both in its template and in an image."""
+    last = fp.first[s + 1]
+    i += 1
+    while i < last and at[i] == at[i - 1] + fp.size[i - 1]:
+        i += 1
+    return i
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def dot(a, b, weight):
+    """The sum of weight a b."""
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i] * weight[i]
+    return total
+
+
+@inner()
+def gram(fp, boxes, members, lead, start, stamps, weight, at, out):
+    """out[i, k] = sum over pixels of weight T_i T_k, the lower triangle; a source's templates follow each other.
+
+    Row r of the footprints has its weights from weight[at[r]] on.
+    """
+    size = stamps.shape[0]
+    for i in range(members.size):
+        s = members[i]
+        for m in range(size):
+            row = i * size + m
+            out[start[row] + lead[row] : start[row] + row + 1] = 0.0
+        p = fp.first[s]
+        while p < fp.first[s + 1]:
+            end = run_end(fp, s, p, at)
+            first, last = fp.start[p], fp.start[end]
+            for m in range(size):
+                for n in range(m + 1):
+                    part = weight[at[p] : at[p] + last - first]
+                    out[start[i * size + m] + i * size + n] += dot(
+                        stamps[m, first:last], stamps[n, first:last], part
+                    )
+            p = end
+        for k in range(lead[i * size] // size, i):
+            t = members[k]
+            if not touch(boxes, s, t):
+                continue
+            for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+                p = fp.first[s] + j - boxes[s, 0]
+                q = fp.first[t] + j - boxes[t, 0]
+                a = max(fp.low[p], fp.low[q])
+                b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+                if a < b:
+                    ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+                    part = weight[at[p] - fp.low[p] + a : at[p] - fp.low[p] + b]
+                    for m in range(size):
+                        left, row = stamps[m, ps + a : ps + b], start[i * size + m] + k * size
+                        for n in range(size):
+                            out[row + n] += dot(left, stamps[n, qs + a : qs + b], part)
+
+
+@inner()
+def add_block(i, start, out, first_second, first_third, second, second_third, third):
+    """Add to a source's own block of a matrix what its shifts are concerned with."""
+    row, column = start[3 * i + 1 : 3 * i + 3], 3 * i
+    out[row[0] + column] += first_second
+    out[row[1] + column] += first_third
+    out[row[0] + column + 1] += second
+    out[row[1] + column + 1] += second_third
+    out[row[1] + column + 2] += third
+
+
+@inner(fastmath=REDUCE)
+def _inner(a, b):
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@inner()
+def cholesky(h, lead, start):
+    """Lower triangle in place; False where the matrix is not positive definite."""
+    for i in range(lead.size):
+        at = start[i]
+        for k in range(lead[i], i + 1):
+            first = max(lead[i], lead[k])
+            total = h[at + k] - _inner(h[at + first : at + k], h[start[k] + first : start[k] + k])
+            if i > k:
+                h[at + k] = total / h[start[k] + k]
+            elif total > 0.0:
+                h[at + i] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@inner()
+def solve(lower, lead, start, x):
+    """x <- (L L^T)^-1 x, in place."""
+    for i in range(x.size):
+        at = start[i]
+        x[i] = (x[i] - _inner(lower[at + lead[i] : at + i], x[lead[i] : i])) / lower[at + i]
+    for i in range(x.size - 1, -1, -1):
+        at = start[i]
+        x[i] /= lower[at + i]
+        for m in range(lead[i], i):
+            x[m] -= lower[at + m] * x[i]
+
+
+@inner()
+def draw_template(fp, s, template, amplitude, at, out):
+    """Add amplitude times one of a source's templates, shape (samples,), to an image."""
+    i = fp.first[s]
+    while i < fp.first[s + 1]:
+        end = run_end(fp, s, i, at)
+        stamp = template[fp.start[i] : fp.start[end]]
+        target = out[at[i] : at[i] + stamp.size]
+        for k in range(stamp.size):
+            target[k] += amplitude * stamp[k]
+        i = end
+
+
+@inner()
+def project(fp, s, template, image, at):
+    """Sum over a source's pixels of one of its templates times an image."""
+    total = 0.0
+    i = fp.first[s]
+    while i < fp.first[s + 1]:
+        end = run_end(fp, s, i, at)
+        stamp = template[fp.start[i] : fp.start[end]]
+        total += _inner(stamp, image[at[i] : at[i] + stamp.size])
+        i = end
+    return total

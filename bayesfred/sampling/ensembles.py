@@ -1,0 +1,269 @@
+"""Ensembles of walkers: where they start, and their steps, which emcee makes.
+
+What an ensemble may meet is settled here: a log-probability that is no number, walkers that cannot
+start a run, walkers that are stuck, and proposals that are hardly ever accepted. These are made
+anew from the draws so far, at a few steps fixed beforehand. What they are made of stands in the
+chain, so that a run that goes on makes the same ones; and from the last time on they are fixed, so
+that the draws after it come from a Markov chain that leaves the posterior alone. The draws before
+it are left out.
+
+References
+----------
+C. Andrieu & J. Thoms (2008), Statistics and Computing 18, 343 (adaptation that ends).
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import emcee
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred.errors import InputError
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.find_map import MapEstimate
+from bayesfred.sampling.moves import LaplaceMove
+
+Floats = npt.NDArray[np.float64]
+
+DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
+# share of accepted moves below which proposals are made anew; half of them by differential
+# evolution bring 0.15 alone
+POOR = 0.3
+LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which it is looked at, over the latter half of them
+DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be made anew
+STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
+# share of the largest spread, in standard deviations, below which there is none in a direction
+DEPENDENT = 1e-8
+
+
+class Step(NamedTuple):
+    """All ensembles after a step."""
+
+    coords: Floats  # (ensembles, walkers, d)
+    log_prob: Floats  # (ensembles, walkers)
+    accepted: npt.NDArray[np.int64]  # (ensembles, walkers) moves accepted so far
+    random: list[tuple[Any, ...]]  # state of each ensemble's random numbers
+    n_invalid: int  # log-probabilities so far that were NaN or +inf
+
+    @classmethod
+    def of(
+        cls, states: list[emcee.State], accepted: npt.NDArray[np.int64], n_invalid: int
+    ) -> "Step":
+        """A copy of the ensembles' states."""
+        coords, log_prob = (
+            np.stack([s.coords for s in states]),
+            np.stack([s.log_prob for s in states]),
+        )
+        return cls(coords, log_prob, accepted, [s.random_state for s in states], n_invalid)
+
+    def states(self) -> list[emcee.State]:
+        """The ensembles for emcee to go on with."""
+        parts = zip(self.coords, self.log_prob, self.random, strict=True)
+        return [
+            emcee.State(coords, log_prob=log_prob, random_state=random)
+            for coords, log_prob, random in parts
+        ]
+
+
+class _LogProb:
+    """The log-posterior as emcee gets it: NaN and +inf, which are no densities, become -inf and are counted."""
+
+    def __init__(self, posterior: Posterior, n_invalid: int) -> None:
+        self.posterior, self.n_invalid = posterior, n_invalid
+
+    def __call__(self, params: Floats) -> Floats:
+        values = self.posterior.unchecked_log_prob(params)
+        invalid = ~(values < np.inf)
+        self.n_invalid += int(invalid.sum())
+        return np.where(invalid, -np.inf, values)
+
+
+def begin(
+    posterior: Posterior, estimate: MapEstimate, seed: int, ensembles: int, walkers: int
+) -> Step:
+    """Walkers at draws of the Laplace approximation that the prior admits.
+
+    Raises
+    ------
+    InputError
+        If the estimate is not one of this posterior, or there is no density around it.
+    """
+    if np.shape(estimate.params) != (posterior.n_parameters,):
+        raise InputError(
+            f"estimate: got {np.size(estimate.params)} parameters, expected "
+            f"{posterior.n_parameters}: find this posterior's maximum"
+        )
+    move = LaplaceMove.of(posterior, estimate)
+    log_prob_of = _LogProb(posterior, 0)
+    states = []
+    for child in np.random.SeedSequence(seed).spawn(ensembles):
+        random = np.random.RandomState(np.random.MT19937(child))
+        coords, log_prob = np.empty((0, posterior.n_parameters)), np.empty(0)
+        for _ in range(100):
+            drawn = move.draw(walkers, random)
+            values = log_prob_of(drawn)
+            good = np.isfinite(values)
+            coords, log_prob = (
+                np.concatenate([coords, drawn[good]]),
+                np.concatenate([log_prob, values[good]]),
+            )
+            if len(coords) >= walkers:
+                break
+        else:
+            raise InputError(
+                "estimate: the posterior has no density around it, expected its maximum: see "
+                "find_map"
+            )
+        states.append(
+            emcee.State(
+                coords[:walkers], log_prob=log_prob[:walkers], random_state=random.get_state()
+            )
+        )
+    return Step.of(states, np.zeros((ensembles, walkers), np.int64), log_prob_of.n_invalid)
+
+
+def check_start(names: tuple[str, ...], start: Step) -> None:
+    """Refuse ensembles from which no run can go on.
+
+    Parameters
+    ----------
+    names : tuple of str, length d
+        The parameters.
+    start : Step
+
+    Raises
+    ------
+    InputError
+        If a walker has no posterior density, or the walkers of an ensemble do not spread in every
+        direction that so many can.
+    """
+    lost = int(np.sum(~(np.isfinite(start.coords).all(axis=2) & np.isfinite(start.log_prob))))
+    if lost:
+        raise InputError(
+            f"start: got {lost} of {start.log_prob.size} walkers without posterior density, "
+            "expected a finite log-probability of "
+            "each: start the run over"
+        )
+    for coords in start.coords:
+        still = [
+            name
+            for name, spread in zip(names, np.ptp(coords, axis=0), strict=True)
+            if spread == 0.0
+        ]
+        if still:
+            raise InputError(
+                f"start: got the same {', '.join(still)} for all walkers of an ensemble, expected "
+                "them to spread: "
+                "see the estimate's covariance"
+            )
+        standardised = (coords - coords.mean(axis=0)) / coords.std(axis=0)
+        rank, full = (
+            np.linalg.matrix_rank(standardised, rtol=DEPENDENT),
+            min(len(coords) - 1, len(names)),
+        )
+        if rank < full:
+            raise InputError(
+                f"start: got walkers that spread in {rank} directions only, expected {full}: see "
+                "the estimate's covariance"
+            )
+
+
+def adapted(chain: Floats) -> int:
+    """Steps after which the proposals in use were made, 0 for those of the Laplace approximation.
+
+    Parameters
+    ----------
+    chain : ndarray, shape (ensembles, steps, walkers, d)
+    """
+    made = 0
+    for look in LOOKS:
+        if (
+            look <= chain.shape[1]
+            and np.any(np.diff(chain[:, look // 2 : look], axis=1) != 0.0, axis=3).mean() < POOR
+        ):
+            made = look
+    return made
+
+
+def _moves(
+    posterior: Posterior, estimate: MapEstimate, chain: Floats
+) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves that make the step after those in the chain, each with its share.
+
+    Differential evolution frees walkers that stand where they are hardly ever proposed a likelier
+    place. That shows in time: before the first look it would only cost draws.
+    """
+    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= LOOKS[0])
+    if made := adapted(chain):
+        draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
+        share = DE_SHARE_ADAPTED
+        with suppress(InputError):  # of too few draws: the next look has more
+            move = LaplaceMove(
+                draws.mean(axis=0), np.cov(draws.T, ddof=0), support=posterior.support
+            )
+    return [(move, 1.0 - share), (emcee.moves.DEMove(live_dangerously=True), share)]
+
+
+def advance(
+    posterior: Posterior, estimate: MapEstimate, start: Step, steps: Sequence[Step] = ()
+) -> Iterator[Step]:
+    """Step all ensembles in turn, without end; a step is one when every ensemble has made it.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    estimate : MapEstimate
+    start : Step
+        From `begin`.
+    steps : sequence of Step
+        Those made already.
+
+    Raises
+    ------
+    InputError
+        If walkers are stuck.
+    """
+    past, last = [step.coords for step in steps], steps[-1] if steps else start
+    log_prob = _LogProb(posterior, last.n_invalid)
+    ensembles, walkers, d = last.coords.shape
+    generators: list[Iterator[emcee.State]] = []
+    idle = np.zeros(last.log_prob.shape, np.int64)  # steps since each walker moved
+    while True:
+        if not generators or len(past) in LOOKS:
+            moves = _moves(
+                posterior,
+                estimate,
+                np.array(past).reshape(-1, ensembles, walkers, d).swapaxes(0, 1),
+            )
+            generators = []
+            for state in last.states():
+                sampler = emcee.EnsembleSampler(walkers, d, log_prob, moves=moves, vectorize=True)
+                sampler.log_prob_fn = (
+                    log_prob  # emcee's wrapper would print a traceback when interrupted
+                )
+                generators.append(
+                    sampler.sample(
+                        state, iterations=None, store=False, skip_initial_state_check=True
+                    )
+                )
+        states = [next(generator) for generator in generators]
+        moved = np.stack(
+            [
+                np.any(state.coords != before, axis=1)
+                for state, before in zip(states, last.coords, strict=True)
+            ]
+        )
+        last = Step.of(states, last.accepted + moved, log_prob.n_invalid)
+        past.append(last.coords)
+        yield last
+        idle = np.where(moved, 0, idle + 1)
+        longest = int(idle.max())
+        if longest >= STUCK or idle.min(axis=1).max() * walkers >= STUCK:
+            raise InputError(
+                f"sampling: got {np.sum(idle == longest)} of {idle.size} walkers stuck, {longest} "
+                "steps without a move, expected "
+                "an estimate that describes the posterior: find the maximum from another start, "
+                "or fit fewer terms"
+            )

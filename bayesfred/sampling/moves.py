@@ -1,0 +1,208 @@
+"""Proposals for emcee.
+
+`LaplaceMove` proposes from the Laplace approximation, independently of where a walker stands. Where
+the posterior is close to Gaussian, as it is for frames with enough photons, nearly every proposal
+is accepted and a draw is worth almost an independent one; `sampling.py` mixes it with differential
+evolution for posteriors that are not.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from emcee.moves import RedBlueMove
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
+from scipy.special import gammaln, logsumexp, ndtr
+from scipy.stats import norm, truncnorm
+
+from bayesfred.errors import InputError
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.find_map import MapEstimate, inverse
+
+Floats = npt.NDArray[np.float64]
+
+HEAVY_SHARE = 0.05
+DEGREES_OF_FREEDOM = 5.0
+
+NESTED = 30  # at most so many approximations to either side
+NEGLIGIBLE = 7.0  # in log weight below the largest: e^-7 = 1e-3
+
+NEAR = 6.0  # standard deviations from the mean within which a bound of the prior counts
+
+
+class LaplaceMove(RedBlueMove):  # type: ignore[misc]
+    r"""Independence proposal: the Laplace approximation with a heavy-tailed share.
+
+    With m and C the approximation's mean and covariance and d^2 = (x - m)^T C^-1 (x - m), the
+    proposal's density is
+
+        q(x) = (1 - w) N(x | m, C) + w t_nu(x | m, C),
+
+    t_nu the multivariate Student distribution; and since it does not depend on the walker's
+    position s, the Hastings factor is q(s) / q(x). Where the posterior is Gaussian the ratio of
+    posterior to proposal is at most 1 / (1 - w), so hardly a move is rejected; a Student
+    distribution alone, at 10 degrees of freedom in 13 dimensions, would have a quarter of them
+    rejected. The share w keeps the ratio bounded where the posterior's tails are heavier than a
+    Gaussian's.
+
+    Several approximations make q a mixture of such densities: see `of`.
+
+    Where a prior ends near m, the parameters concerned are drawn one after the other, before the
+    others, from what the support leaves of their normal distribution given those before: x = m + L
+    z with L lower triangular, and z_i a normal variable cut to an interval that depends on z_1 to
+    z_(i-1). That divides the normal density by the product of the intervals' masses.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (d,) or (k, d)
+        m, the posterior's maximum; of k approximations.
+    covariance : ndarray, shape (d, d) or (k, d, d)
+        C, the Laplace approximation's covariance.
+    weights : array_like, shape (k,), optional
+        Shares of the approximations; they sum to 1.
+    support : tuple of ndarray, shape (d,), optional
+        Least and largest values that the prior admits.
+
+    Raises
+    ------
+    InputError
+        If the covariance is not a positive definite matrix of finite numbers.
+
+    References
+    ----------
+    L. Tierney (1994), Annals of Statistics 22, 1701, Section 2.3.4 (independence chains). T.
+    Hesterberg (1995), Technometrics 37, 185 (defensive mixtures). A. Genz (1992), J. Comp. Graph.
+    Stat. 1, 141 (variables cut one after the other).
+
+    Examples
+    --------
+    >>> move = LaplaceMove(np.zeros(1), np.eye(1))
+    >>> q, log_factor = move.get_proposal(np.zeros((3, 1)), [], np.random.RandomState(1))
+    >>> q.shape, log_factor.shape
+    ((3, 1), (3,))
+    """
+
+    def __init__(
+        self,
+        mean: Floats,
+        covariance: Floats,
+        weights: npt.ArrayLike = (1.0,),
+        support: tuple[npt.ArrayLike, npt.ArrayLike] = (-np.inf, np.inf),
+    ) -> None:
+        # the proposal does not come from the ensemble, whatever its size: all walkers move at once
+        super().__init__(nsplits=1, randomize_split=False, live_dangerously=True)
+        means = np.atleast_2d(mean)
+        d = means.shape[1]
+        low, high = (np.broadcast_to(bound, d) for bound in support)
+        try:
+            covariances = np.reshape(covariance, (-1, d, d))
+            reach = NEAR * np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
+            near = np.any((means - low < reach) | (high - means < reach), axis=0)
+            self.order = np.argsort(~near, kind="stable")  # parameters near a bound first
+            self.lowers = np.array(
+                [cholesky(c[np.ix_(self.order, self.order)], lower=True) for c in covariances]
+            )
+        except (LinAlgError, ValueError):
+            raise InputError(
+                "estimate: got no positive definite covariance, expected the maximum's: see "
+                "find_map"
+            ) from None
+        self.bounds = np.stack([low, high], axis=1)[near]
+        self.means = means[:, self.order]
+        self.weights = np.asarray(weights, dtype=np.float64)
+
+    @classmethod
+    def of(cls, posterior: Posterior, estimate: MapEstimate) -> "LaplaceMove":
+        """The move for a posterior, given its maximum.
+
+        The scatter tau of the sources' positions sets the errors of all that is measured from
+        positions, so that one Gaussian for all its values is a poor approximation. It is nested
+        then: for values tau_k in a geometric series, half an error apart and reaching to either
+        side as far as there is weight (the mean lies above the maximum, as for any scatter about a
+        fit), the other parameters have their Laplace approximation given tau_k, one Newton step
+        from the estimate. The k-th weight is proportional to the posterior there times the root of
+        the determinant of the covariance, that of tau being the squared distance between the tau_k.
+
+        References
+        ----------
+        H. Rue, S. Martino & N. Chopin (2009), JRSS B 71, 319, Section 3.
+        """
+        if not posterior.nuisances.position_scatter:
+            mean = estimate.params
+            if np.any(
+                (mean <= posterior.support[0]) | (mean >= posterior.support[1])
+            ):  # the paraboloid's top is outside
+                mean = mean + estimate.covariance @ posterior.gradient(mean)
+            return cls(mean, estimate.covariance, support=posterior.support)
+        j = posterior.parameter_names.index("position_scatter")
+        rest = np.arange(estimate.params.size) != j
+        ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
+        means, covariances = [], []
+        logs: list[float] = []
+        for outward in (range(NESTED), range(-1, -NESTED, -1)):
+            for k in outward:
+                mean, covariance = estimate.params.copy(), np.zeros(estimate.covariance.shape)
+                mean[j] *= np.exp(k * ratio)
+                covariance[np.ix_(rest, rest)] = inverse(
+                    posterior.information(mean)[np.ix_(rest, rest)]
+                )
+                mean += covariance @ posterior.gradient(mean)
+                covariance[j, j] = (ratio * mean[j]) ** 2
+                log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(covariance)[1]
+                if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
+                    break
+                means.append(mean)
+                covariances.append(covariance)
+                logs.append(log)
+        return cls(
+            np.array(means),
+            np.array(covariances),
+            np.exp(np.array(logs) - logsumexp(logs)),
+            posterior.support,
+        )
+
+    def draw(self, n: int, random: np.random.RandomState) -> Floats:
+        """n draws from the proposal, shape (n, d)."""
+        k = random.choice(len(self.weights), n, p=self.weights)
+        z = random.standard_normal((n, self.means.shape[1]))
+        stretch = np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, n))
+        heavy = random.random_sample(n) < HEAVY_SHARE
+        for i in range(len(self.bounds)):
+            a, b = self._interval(i, self.means[k], self.lowers[k], z)
+            z[:, i] = np.where(heavy, z[:, i], truncnorm.ppf(ndtr(z[:, i]), a, b))
+        z *= np.where(heavy, stretch, 1.0)[:, None]
+        x = np.empty_like(z)
+        x[:, self.order] = self.means[k] + np.einsum("nij,nj->ni", self.lowers[k], z)
+        return x
+
+    def _interval(self, i: int, means: Floats, lowers: Floats, z: Floats) -> Floats:
+        """Where the i-th of the parameters near a bound keeps z_i, given those before it: both ends, shape (2, n)."""
+        given = means[..., i] + np.einsum("...j,...j->...", lowers[..., i, :i], z[:, :i])
+        return np.asarray((self.bounds[i][:, None] - given) / lowers[..., i, i])
+
+    def log_density(self, x: Floats) -> Floats:
+        """log q at x, shape (n, d)."""
+        d, nu = x.shape[1], DEGREES_OF_FREEDOM
+        peak = gammaln(0.5 * (nu + d)) - gammaln(0.5 * nu) - 0.5 * d * np.log(nu * np.pi)
+        parts = []
+        for mean, lower, weight in zip(self.means, self.lowers, self.weights, strict=True):
+            z = solve_triangular(lower, (x[:, self.order] - mean).T, lower=True).T
+            squared = (z**2).sum(axis=1)
+            normal = np.log1p(-HEAVY_SHARE) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
+            for i in range(len(self.bounds)):
+                normal += truncnorm.logpdf(
+                    z[:, i], *self._interval(i, mean, lower, z)
+                ) - norm.logpdf(z[:, i])
+            student = np.log(HEAVY_SHARE) + peak - 0.5 * (nu + d) * np.log1p(squared / nu)
+            parts.append(
+                np.logaddexp(normal, student) + np.log(weight) - np.log(np.diag(lower)).sum()
+            )
+        return np.asarray(np.logaddexp.reduce(parts, axis=0))
+
+    def get_proposal(
+        self, s: Floats, c: Sequence[Floats], random: np.random.RandomState
+    ) -> tuple[Floats, Floats]:
+        """New positions for the walkers at s, and log q(s) - log q(new); the other walkers c are not used."""
+        new = self.draw(len(s), random)
+        before, after = np.split(self.log_density(np.concatenate([s, new])), 2)
+        return new, before - after

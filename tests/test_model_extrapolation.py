@@ -1,0 +1,165 @@
+"""Free fluxes extrapolated from other parameters: the likelihood is the one that is searched for from nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_model import known, make_model, make_truth
+
+from bayesfred.analysis.verify import verify
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import MoffatPSF
+from bayesfred.model.extrapolation import FluxExtrapolation
+from bayesfred.model.kernels.extrapolate import ENOUGH
+from bayesfred.model.noise import PoissonNoise
+from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.sampling.sampler import sample
+
+Floats = NDArray[np.float64]
+
+AGREE = 2e-6  # of log-probabilities
+APART = SourceCatalog.grid(3, 17.0, 4e3)
+TOUCHING = SourceCatalog.grid(3, 9.0, 2e4)
+CASES: dict[str, tuple[ForwardModel, Nuisances, PoissonNoise]] = {
+    "apart": (make_model(APART, tolerance=1e-8), Nuisances("free"), PoissonNoise()),
+    "touching": (make_model(TOUCHING, tolerance=1e-8), Nuisances("free"), PoissonNoise()),
+    "faint": (
+        make_model(SourceCatalog.grid(3, 9.0, 200.0), tolerance=1e-8),
+        Nuisances("free"),
+        PoissonNoise(),
+    ),
+    "nuisances": (
+        make_model(TOUCHING, tolerance=1e-8),
+        Nuisances("free", offset=True, background_order=2),
+        PoissonNoise(1.5),
+    ),
+    "box": (
+        make_model(APART, detector=Detector((20, 25), 3, "box"), tolerance=1e-6),
+        Nuisances("free"),
+        PoissonNoise(),
+    ),
+    "Moffat": (
+        replace(make_model(TOUCHING), psf=MoffatPSF(5.0, 3.0), tolerance=1e-4),
+        Nuisances("free"),
+        PoissonNoise(),
+    ),
+}
+
+
+def solved(case: str) -> tuple[Posterior, Posterior, MapEstimate]:
+    """A posterior, the same near its maximum, and the maximum."""
+    model, nuisances, noise = CASES[case]
+    rng = np.random.default_rng(60)
+    options: Any = {
+        "noise": noise,
+        "nuisances": nuisances,
+        "mask": rng.random(model.detector.shape) < 0.95,
+    }
+    named = known(make_truth(model, rng), nuisances)
+    blank = Posterior(model, np.ones(model.detector.shape), **options)
+    truth = np.array([named[name] for name in blank.parameter_names])
+    frame = blank.simulate(truth, rng)
+    assert frame is not None
+    posterior = Posterior(model, frame, **options)
+    best = find_map(posterior, truth)
+    return posterior, posterior.near(best.params, best.covariance), best
+
+
+def draws(best: MapEstimate, sd: float) -> Floats:
+    """Draws of the Laplace approximation, so many times as wide."""
+    whitened = np.random.default_rng(61).standard_normal((12, best.params.size))
+    return np.asarray(best.params + sd * whitened @ np.linalg.cholesky(best.covariance).T)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_near_the_maximum_log_prob_is_the_same(case: str) -> None:
+    posterior, near, best = solved(case)
+    for sd in (0.1, 1.0, 3.0):
+        searched, extrapolated = posterior.log_prob(draws(best, sd)), near.log_prob(draws(best, sd))
+        assert extrapolated == pytest.approx(searched, rel=0, abs=AGREE)
+        if sd == 1.0:  # other digits: most are not the searched ones once more
+            assert np.mean(extrapolated != searched) > 0.5
+
+
+@pytest.mark.parametrize("case", ["touching", "faint"])
+def test_far_from_it_log_prob_is_the_same(case: str) -> None:
+    posterior, near, best = solved(case)
+    for sd in (10.0, 100.0, 1000.0):
+        searched, extrapolated = posterior.log_prob(draws(best, sd)), near.log_prob(draws(best, sd))
+        assert np.array_equal(np.isfinite(extrapolated), np.isfinite(searched))
+        assert extrapolated == pytest.approx(searched, rel=1e-12, abs=ENOUGH)
+
+
+def changed(near: Posterior, **parts: Any) -> Posterior:
+    """The same with other beliefs about the fluxes."""
+    assert isinstance(near._extrapolation, FluxExtrapolation)
+    other = near.near(near._extrapolation.params, np.full((near.n_parameters,) * 2, np.nan))
+    object.__setattr__(other, "_extrapolation", near._extrapolation._replace(**parts))
+    return other
+
+
+def test_wrong_beliefs_cost_time_alone_unless_they_are_about_the_hessian() -> None:
+    posterior, near, best = solved("touching")
+    beliefs = near._extrapolation
+    assert beliefs is not None
+    params = draws(best, 1.0)
+    searched = posterior.log_prob(params)
+    for flux in (1.02, 3.0, -1.0):
+        assert changed(near, fluxes=flux * beliefs.fluxes).log_prob(params) == pytest.approx(
+            searched, rel=0, abs=AGREE
+        )
+    assert changed(near, slope=0.0 * beliefs.slope).log_prob(params) == pytest.approx(
+        searched, rel=0, abs=AGREE
+    )
+    # negative control: without the products of neighbours' templates it is not
+    diagonal, first, _, *rest = beliefs.hessian
+    alone = changed(near, hessian=(diagonal, first, first, *rest))
+    assert np.abs(alone.log_prob(params) - searched).min() > 10 * AGREE
+
+
+def test_without_free_fluxes_there_is_nothing_to_foretell() -> None:
+    model = make_model(APART)
+    for nuisances in (Nuisances(), Nuisances("scale"), Nuisances("free", position_scatter=True)):
+        posterior = Posterior(model, model.expected_counts(np.zeros(12), 3.0), nuisances=nuisances)
+        assert posterior.near(posterior.start(), np.eye(posterior.n_parameters)) is posterior
+
+
+def test_a_chain_of_free_fluxes_holds_the_log_prob_of_its_draws(tmp_path: Path) -> None:
+    posterior, _, best = solved("touching")
+
+    def run(name: str, steps: int, **options: Any) -> Any:
+        return sample(
+            posterior,
+            best,
+            path=tmp_path / name,
+            seed=3,
+            walkers=8,
+            steps=steps,
+            progress=False,
+            **options,
+        )
+
+    whole = run("whole.h5", 6)
+    assert posterior.log_prob(whole.chain.reshape(-1, 13)) == pytest.approx(
+        whole.log_prob.ravel(), rel=0, abs=AGREE
+    )
+    run("parts.h5", 3)
+    parts = run("parts.h5", 6, resume=True)
+    assert np.array_equal(parts.chain, whole.chain) and np.array_equal(
+        parts.log_prob, whole.log_prob
+    )
+    assert all(check.holds for check in verify(tmp_path / "whole.h5"))
+
+
+def test_a_chain_that_went_far_verifies(tmp_path: Path) -> None:
+    posterior, _, best = solved("faint")
+    wide = replace(best, covariance=25.0 * best.covariance)
+    path = tmp_path / "wide.h5"
+    sample(posterior, wide, path=path, seed=4, walkers=8, steps=6, progress=False)
+    assert {check.what: check.holds for check in verify(path)}["log-probability"]

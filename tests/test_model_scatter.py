@@ -1,0 +1,246 @@
+"""Sources off their catalogue positions: the profiled shifts against dense images, closed forms and refits of simulated data."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import optimize, stats
+from test_model import LIMIT, Noise, background_image, dense_image, known, make_model, make_truth
+from test_model_derivatives import STEP, errors, five_point, joint
+
+from bayesfred.errors import InputError
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import PoissonNoise, simulate
+from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize.find_map import find_map
+
+Floats = NDArray[np.float64]
+
+SCATTER = Nuisances("free", offset=True, psf_sigma=True, background_order=1, position_scatter=True)
+
+
+def shifted_image(model: ForwardModel, named: dict[str, float], s: int, shift: Floats) -> Floats:
+    """Source s at unit flux, moved by `shift` as imaged: another offset, for the distortion is the catalogue position's."""
+    moved = {
+        **named,
+        "offset_x": named.get("offset_x", 0.0) + shift[0],
+        "offset_y": named.get("offset_y", 0.0) + shift[1],
+    }
+    return dense_image(model, moved, np.eye(len(model.sources))[s])
+
+
+def scattered(
+    model: ForwardModel,
+    tau: float,
+    rng: np.random.Generator,
+    background: float,
+    noise: Noise = PoissonNoise(),
+    **options: Any,
+) -> tuple[Posterior, dict[str, float]]:
+    """The posterior given a frame whose sources scatter by tau about the catalogue, and the true parameters."""
+    named = known({**make_truth(model, rng, background), "position_scatter": tau}, SCATTER)
+    shifts = tau * rng.standard_normal((len(model.sources), 2))
+    images = [
+        flux * shifted_image(model, named, s, shifts[s])
+        for s, flux in enumerate(model.sources.flux)
+    ]
+    frame = noise.draw(np.sum(images, axis=0), background_image(model.detector.shape, named), rng)
+    return Posterior(model, frame, noise=noise, nuisances=SCATTER, **options), named
+
+
+def three(flux: float, **options: Any) -> ForwardModel:
+    """Two sources whose images overlap and one apart."""
+    catalogue = SourceCatalog(
+        [-12.0, -6.5, 12.0], [-5.0, -2.0, 3.0], np.array([1.0, 0.4, 0.7]) * flux
+    )
+    return make_model(catalogue, **{"sigma": 2.0, "detector": Detector((32, 44)), **options})
+
+
+CASES: dict[str, tuple[ForwardModel, float, float, Noise]] = {
+    "bright": (three(2e4), 0.2, 3.0, PoissonNoise()),
+    "faint": (three(300.0), 0.2, 0.5, PoissonNoise()),
+    "read noise": (three(4e3), 0.1, 3.0, PoissonNoise(1.5)),
+    "printed kernel": (three(4e3, conserve_flux=False), 0.1, 3.0, PoissonNoise()),
+    "binned": (three(4e3, detector=Detector((16, 22), 2)), 0.3, 3.0, PoissonNoise()),
+}
+
+
+def at_random(posterior: Posterior, named: dict[str, float], rng: np.random.Generator) -> Floats:
+    """Parameters half an error from the truth."""
+    truth = np.array([named[name] for name in posterior.parameter_names])
+    return np.asarray(truth + 0.5 * errors(posterior, truth) * rng.uniform(-1, 1, truth.size))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_gradient_is_that_of_log_prob(case: str) -> None:
+    model, tau, background, noise = CASES[case]
+    rng = np.random.default_rng(50)
+    mask = rng.random(model.detector.shape) < 0.9
+    posterior, named = scattered(model, tau, rng, background, noise, mask=mask)
+    params = at_random(posterior, named, rng)
+    scale = errors(posterior, params)
+    numerical = [
+        five_point(posterior.log_prob, params, k, STEP * scale[k]) for k in range(params.size)
+    ]
+    assert posterior.gradient(params) * scale == pytest.approx(
+        np.array(numerical) * scale, rel=1e-6, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("case", ["bright", "faint"])
+def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> None:
+    model, tau, background, _ = CASES[case]
+    rng = np.random.default_rng(51)
+    posterior, named = scattered(model, tau, rng, background)
+    params = at_random(posterior, named, rng)
+    named = dict(zip(posterior.parameter_names, params, strict=True))
+    tau, level, n = (
+        named["position_scatter"],
+        background_image(model.detector.shape, named).ravel(),
+        len(model.sources),
+    )
+
+    def templates(phi: Floats) -> Floats:
+        return np.array(
+            [
+                shifted_image(model, named, s, phi[n + 2 * s : n + 2 * s + 2]).ravel()
+                for s in range(n)
+            ]
+        )
+
+    def value(z: Floats) -> float:
+        fluxes, shifts = np.exp(z[:n]), tau * z[n:]
+        prior = stats.norm(0, tau).logpdf(shifts).sum()
+        stamps = templates(np.concatenate([fluxes, shifts]))
+        return float(joint(posterior, stamps, level, fluxes) + prior)
+
+    found = optimize.minimize(
+        lambda z: -value(z), np.append(np.log(model.sources.flux), np.zeros(2 * n)), tol=1e-9
+    )
+    phi = np.append(np.exp(found.x[:n]), tau * found.x[n:])
+
+    def mean(phi: Floats) -> Floats:
+        return phi[:n] @ templates(phi) + level
+
+    steps = np.append(1e-3 * phi[:n], np.full(2 * n, 1e-2))
+    slopes = np.stack([five_point(mean, phi, k, steps[k]) for k in range(3 * n)])
+    h = (slopes * posterior.counts.ravel() / mean(phi) ** 2) @ slopes.T + np.diag(
+        np.append(phi[:n] ** -2, np.full(2 * n, tau**-2))
+    )
+    expected = value(found.x) + 1.5 * n * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(h)[1]
+    assert posterior.fluxes(params) == pytest.approx(phi[:n], rel=1e-4)
+    assert posterior.log_prob(params) - posterior.log_prior(params)[0] == pytest.approx(
+        expected, abs=1e-5
+    )
+
+    # the Schur complement over the same templates, and what the shifts' size says of their scatter
+    scale = errors(posterior, params)
+    k = posterior.parameter_names.index("position_scatter")
+    others = [i for i in range(params.size) if i != k]
+
+    def image(values: Floats) -> Floats:
+        given = dict(zip(posterior.parameter_names, values, strict=True))
+        sources = [
+            phi[s] * shifted_image(model, given, s, phi[n + 2 * s : n + 2 * s + 2])
+            for s in range(n)
+        ]
+        return np.asarray(
+            (np.sum(sources, axis=0) + background_image(model.detector.shape, given)).ravel()
+        )
+
+    outer = np.stack([five_point(image, params, i, STEP * scale[i]) for i in others])
+    weight = 1 / mean(phi)
+    inner = (slopes * weight) @ slopes.T
+    h = inner + np.diag(np.append(phi[:n] ** -2, np.full(2 * n, tau**-2)))
+    cross = (outer * weight) @ slopes.T
+    schur = (outer * weight) @ outer.T - cross @ np.linalg.solve(h, cross.T)
+    fisher = posterior.fisher(params)
+    both = np.outer(scale, scale)
+    assert fisher[np.ix_(others, others)] * both[np.ix_(others, others)] == pytest.approx(
+        schur * both[np.ix_(others, others)], abs=1e-4
+    )
+    measured = inner.copy()
+    measured[:n, :n] += np.diag(phi[:n] ** -2)
+    if (
+        case == "bright"
+    ):  # a source's two coordinates are nearly independent: each alone tells of the scatter
+        variance = np.diag(np.linalg.inv(measured))[n:]
+        assert fisher[k, k] == pytest.approx(
+            np.sum(2 * tau**2 / (tau**2 + variance) ** 2), rel=0.01
+        )
+    assert not fisher[k, others].any()
+
+
+def test_scatter_is_outside_the_support_below_zero_and_needs_free_fluxes() -> None:
+    model = three(4e3)
+    rng = np.random.default_rng(52)
+    prior = {"position_scatter": stats.norm(0.0, 1.0)}
+    posterior, named = scattered(model, 0.1, rng, 3.0, prior=prior)
+    params = np.array([named[name] for name in posterior.parameter_names])
+    k = posterior.parameter_names.index("position_scatter")
+    near, zero, below = (
+        params + (value - params[k]) * np.eye(params.size)[k] for value in (1e-5, 0.0, -0.1)
+    )
+    assert posterior.log_prob(below) == -math.inf
+    plain = Posterior(
+        model,
+        posterior.counts,
+        nuisances=Nuisances("free", offset=True, psf_sigma=True, background_order=1),
+    )
+    # without scatter it is the posterior of exact positions, and continuously so
+    expected = plain.log_prob(np.delete(params, k)) + prior["position_scatter"].logpdf(0.0)
+    assert posterior.log_prob(zero) == pytest.approx(expected, abs=1e-8)
+    assert posterior.log_prob(near) == pytest.approx(expected, abs=1e-4)
+    with pytest.raises(InputError, match="position_scatter: got it with scale fluxes"):
+        Nuisances("scale", position_scatter=True)
+
+
+FRAMES = 24
+
+
+def test_errors_hold_where_positions_scatter() -> None:
+    """Refits of simulated frames: 25 sources whose positions scatter by five times what photon noise does to them."""
+    rng = np.random.default_rng(53)
+    terms = PolynomialDistortion(
+        [(1, 0, 0, 0), (3, 0, 0, 0), (1, 2, 0, 0)], [(0, 1, 0, 0), (2, 1, 0, 0), (0, 3, 0, 0)]
+    )
+    grid, tau = SourceCatalog.grid(5, 18.0, 4e3), 0.15
+    theta = rng.standard_normal(6) * np.array([1e-3, 1e-6, 1e-6, 1e-3, 1e-6, 1e-6])
+
+    def model(catalogue: SourceCatalog) -> ForwardModel:
+        return ForwardModel(Detector((96, 96)), catalogue, GaussianPSF(1.5), terms)
+
+    squares: dict[bool, list[float]] = {True: [], False: []}
+    found = []
+    for frame in range(FRAMES):
+        moved = SourceCatalog(
+            grid.x + tau * rng.standard_normal(25),
+            grid.y + tau * rng.standard_normal(25),
+            grid.flux,
+        )
+        counts = simulate(model(moved), theta, 2.0, seed=frame)
+        for scatter in (True, False):
+            posterior = Posterior(
+                model(grid), counts, nuisances=Nuisances("free", position_scatter=scatter)
+            )
+            estimate = find_map(posterior)
+            off = estimate.params[:6] - theta
+            squares[scatter].append(off @ np.linalg.solve(estimate.covariance[:6, :6], off) / 6)
+            if scatter:
+                found.append(estimate.params[posterior.parameter_names.index("position_scatter")])
+    # 144 pulls: their mean square is 1 but for a Monte Carlo error of sqrt(2 / 144); the scatter,
+    # known to 10 % from 50 coordinates, makes them Student's t with about 50 degrees of freedom,
+    # whose variance is 50 / 48
+    error = math.sqrt(2 / (6 * FRAMES))
+    assert abs(np.mean(squares[True]) - 50 / 48) < LIMIT * error
+    assert abs(np.mean(found) / tau - 1) < 0.03 + LIMIT * 0.1 / math.sqrt(
+        FRAMES
+    )  # its maximum is biased by some 1 / 50
+    # negative control: photon noise alone does not explain the errors
+    assert np.mean(squares[False]) > 1 + 10 * LIMIT * error

@@ -1,0 +1,263 @@
+"""Sigma clipping: spots of no source, and sources without a spot, are left out, and the error bars of the rest hold."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import simulate
+from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize.find_map import MapEstimate, find_map, reject_outliers
+from bayesfred.optimize.matching import Field
+from bayesfred.optimize.outliers import clip, settle
+
+Floats = NDArray[np.float64]
+
+COMPLETE = PolynomialDistortion.full_polynomial(3)
+FLUX, BACKGROUND = 1e4, 2.0
+
+
+def frame(
+    seed: int,
+    n: int = 8,
+    spacing: float = 20.0,
+    sigma: float = 2.0,
+    nuisances: Nuisances = Nuisances(),
+    binning: int = 1,
+) -> tuple[Posterior, Floats, NDArray[np.int64], Floats]:
+    """A grid of 9 x 9 stars without n of them, and with n spots elsewhere: posterior, truth, stars without a spot, spots."""
+    rng = np.random.default_rng(seed)
+    sources = SourceCatalog.grid(9, spacing, FLUX)
+    detector = Detector((round(11 * spacing / binning),) * 2, binning)
+    model = ForwardModel(detector, sources, GaussianPSF(sigma), COMPLETE)
+    missing = np.sort(rng.choice(81, n, replace=False))
+    spots = rng.uniform(-4.0, 4.0, (2, n)) * spacing
+    scale = Field(Posterior(model, np.ones(detector.shape))).scale
+    theta = 0.03 * scale * rng.standard_normal(scale.size)
+    x, y = (
+        np.append(np.delete(axis, missing), more)
+        for axis, more in zip((sources.x, sources.y), spots, strict=True)
+    )
+    real = ForwardModel(detector, SourceCatalog(x, y, np.full(x.size, FLUX)), model.psf, COMPLETE)
+    counts = simulate(real, theta, BACKGROUND * binning**2, seed=seed)
+    posterior = Posterior(model, counts, nuisances=nuisances)
+    known = dict(zip(COMPLETE.names, theta, strict=True)) | {
+        "background": BACKGROUND * binning**2,
+        "flux_scale": 1.0,
+    }
+    return (
+        posterior,
+        np.array([known.get(name, 0.0) for name in posterior.parameter_names]),
+        missing,
+        spots.T,
+    )
+
+
+def square(truth: Floats, estimate: MapEstimate) -> float:
+    """Squared Mahalanobis distance of the truth, which is chi-square distributed where error bars hold."""
+    d = truth - estimate.params
+    return float(d @ np.linalg.solve(estimate.covariance, d))
+
+
+def pixels(posterior: Posterior, places: Floats) -> NDArray[np.int64]:
+    """Columns and rows of places in fine pixels."""
+    detector = posterior.model.detector
+    return np.rint(places / detector.binning + 0.5 * (detector.shape[0] - 1)).astype(int).T
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"sigma": 3.0, "binning": 2},
+        {"nuisances": Nuisances(offset=True)},
+        {"nuisances": Nuisances("scale")},
+    ],
+)
+def test_missing_sources_and_foreign_spots_are_left_out_and_nothing_else(
+    options: dict[str, Any],
+) -> None:
+    posterior, truth, missing, spots = frame(1, **options)
+    found = clip(posterior, truth)
+    assert np.flatnonzero(found.missing).tolist() == missing.tolist()
+    column, row = pixels(posterior, spots)
+    assert not found.posterior.mask[row, column].any()
+    v, u = np.nonzero(~found.posterior.mask)
+    distance = np.hypot(u[:, None] - column, v[:, None] - row).min(axis=1)
+    assert distance.max() < 7.0 * posterior.model.psf.sigma / posterior.model.detector.binning
+    s = posterior.model.sources
+    assert np.array_equal(found.posterior.model.sources.x, np.delete(s.x, missing))
+    assert 0.85 < found.posterior.mask.mean() < 1.0
+    # negative control: of a frame that holds what the catalogue says nothing is left out
+    clean, truth, *_ = frame(1, n=0, **options)
+    assert clip(clean, truth).posterior is clean
+
+
+def test_what_is_masked_is_the_light_of_the_spots() -> None:
+    posterior, truth, _, spots = frame(1)
+    found, model = clip(posterior, truth), posterior.model
+    foreign = ForwardModel(
+        model.detector, SourceCatalog(*spots.T, np.full(8, FLUX)), model.psf, COMPLETE
+    )
+    light = foreign.expected_counts(truth[: COMPLETE.n_terms]) / found.posterior.sigma(truth)
+    assert light[found.posterior.mask].max() < 0.5  # standard deviations
+    assert found.posterior.mask[light < 1e-6].all()
+
+
+def test_a_faint_neighbour_of_a_bright_spot_is_not_missing() -> None:
+    sources = SourceCatalog(
+        [0.0, 30.0, -30.0, 0.0], [0.0, 30.0, 30.0, -35.0], [2e3, FLUX, FLUX, FLUX]
+    )
+    model = ForwardModel(Detector((101, 101)), sources, GaussianPSF(2.0), COMPLETE)
+    theta = np.zeros(COMPLETE.n_terms)
+    foreign = replace(
+        model, sources=SourceCatalog([6.0, *sources.x], [0.0, *sources.y], [4e4, *sources.flux])
+    )
+    posterior = Posterior(model, simulate(foreign, theta, BACKGROUND, seed=1))
+    found = clip(posterior, np.append(theta, BACKGROUND))
+    assert not found.missing.any() and not found.posterior.mask[50, 56]
+    # negative control: in the filtered frame it stands in the spot's dark ring, and lacks more than
+    # its light
+    residual = posterior.counts - posterior.expected_counts(np.append(theta, BACKGROUND))
+    assert ndimage.gaussian_laplace(residual, 2.0)[50, 50] > 2e3 / (4.0 * np.pi * 2.0**4)
+    # and the other way round: the faint source is missing, the spot, now in the catalogue, is there
+    without = replace(
+        model,
+        sources=SourceCatalog(
+            [6.0, *sources.x[1:]], [0.0, *sources.y[1:]], [4e4, *sources.flux[1:]]
+        ),
+    )
+    lacking = Posterior(foreign, simulate(without, theta, BACKGROUND, seed=1))
+    assert np.flatnonzero(clip(lacking, np.append(theta, BACKGROUND)).missing).tolist() == [1]
+
+
+def test_spots_are_bent_as_the_distortion_bends_them() -> None:
+    """Near the corner of a field that makes spots a third wider there, looks with round spots leave 3.9 instead of 0.2."""
+    model = ForwardModel(
+        Detector((201, 201)), SourceCatalog.grid(7, 25.0, 3e4), GaussianPSF(3.0), COMPLETE
+    )
+    theta = np.zeros(COMPLETE.n_terms)
+    theta[[COMPLETE.names.index("f_u2x"), COMPLETE.names.index("g_v2y")]] = -4e-5
+    star = replace(model, sources=SourceCatalog([62.0], [62.0], [3e5]))
+    posterior = Posterior(
+        model, simulate(model, theta, BACKGROUND, seed=1) + simulate(star, theta, 0.0, seed=2)
+    )
+    found = clip(posterior, np.append(theta, BACKGROUND))
+    noise = found.posterior.sigma(np.append(theta, BACKGROUND))
+    light = star.expected_counts(theta) / noise
+    assert light[found.posterior.mask].max() < 0.5 and not found.missing.any()
+    # negative control: what a round spot in its place does not cover
+    u, v = COMPLETE.image_position(theta, 62.0, 62.0)
+    round_spot = replace(
+        model, sources=SourceCatalog([float(u)], [float(v)], [3e5])
+    ).expected_counts(np.zeros_like(theta))
+    assert light[round_spot < 0.3 * noise].max() > 2.0
+
+
+def test_dead_pixels_are_masked() -> None:
+    posterior, truth, *_ = frame(2, n=0)
+    counts = posterior.counts.copy()
+    counts[108:113, 108:113] = 0.0  # the star in the middle, half of it
+    dead = Posterior(posterior.model, counts)
+    found = clip(dead, truth)
+    assert found.missing[40] or not found.posterior.mask[108:113, 108:113].any()
+    assert found.missing.sum() <= 1
+
+
+def test_wrong_parameters_are_not_blamed_on_the_catalogue() -> None:
+    posterior, truth, *_ = frame(1)
+    elsewhere = Posterior(posterior.model, np.roll(posterior.counts, 10, axis=1))  # half a spacing
+    assert clip(elsewhere, truth, (0.0, 0.3)).posterior is elsewhere
+    assert clip(elsewhere, truth).missing.sum() < 10
+    # half a PSF's width off, bright stars stand out as much as foreign spots, but for a tolerance
+    shifted = Posterior(posterior.model, np.roll(posterior.counts, 1, axis=1))
+    assert clip(shifted, truth, (0.0,)).posterior is shifted
+    assert 8 <= clip(shifted, truth).missing.sum() < 20
+    # where no pixel would be left, none is left out
+    few = np.zeros(posterior.counts.shape, bool)
+    few[100:103, 100:103] = True
+    bright = Posterior(posterior.model, np.where(few, 1e4, 0.0), mask=few)
+    assert clip(bright, truth).posterior is bright
+
+
+def test_free_fluxes_fall_where_a_source_is_missing() -> None:
+    posterior, truth, missing, spots = frame(1, nuisances=Nuisances("free"))
+    found = clip(posterior, truth)
+    column, row = pixels(posterior, spots)
+    assert not found.posterior.mask[row, column].any()
+    s = (
+        posterior.model.sources
+    )  # a star that a spot touches took its light, and lacks it in its middle
+    touched = (
+        np.hypot(s.x[:, None] - spots[:, 0], s.y[:, None] - spots[:, 1]).min(axis=1)
+        < 4.0 * posterior.model.psf.sigma
+    )
+    assert not found.missing[~touched].any()
+    assert posterior.fluxes(truth)[missing].max() < 0.5 * FLUX
+
+
+def test_masked_pixels_hold_nothing_to_clip() -> None:
+    posterior, truth, missing, spots = frame(1)
+    v, u = np.indices(posterior.counts.shape) - 0.5 * (posterior.counts.shape[0] - 1)
+    s = posterior.model.sources
+    mask = np.ones(posterior.counts.shape, bool)
+    for x, y in [*spots, *zip(s.x[missing], s.y[missing], strict=True)]:
+        mask &= (u - x) ** 2 + (v - y) ** 2 > 12.0**2
+    counts = np.where(mask, posterior.counts, 1e6)
+    masked = Posterior(posterior.model, counts, mask=mask)
+    assert clip(masked, truth).posterior is masked
+    clipped, estimate = reject_outliers(masked)
+    assert clipped is masked and "left out" not in estimate.message
+
+
+def test_clean_frames_are_fitted_whole() -> None:
+    posterior, *_ = frame(3, n=0)
+    clipped, estimate = reject_outliers(posterior)
+    assert clipped is posterior and square(find_map(posterior).params, estimate) < 1e-5
+    assert "left out" not in estimate.message and "left out" not in find_map(posterior).message
+
+
+def test_error_bars_hold_where_a_tenth_is_missing_and_a_tenth_foreign() -> None:
+    """Ten frames: their mean chi-square per parameter has a Monte Carlo error of sqrt(2 / 470) = 0.065."""
+    squares, whole = [], []
+    for seed in range(10):
+        posterior, truth, missing, _ = frame(seed)
+        clipped, estimate = reject_outliers(posterior)
+        assert (
+            estimate.converged and f"{81 - len(clipped.model.sources)} sources" in estimate.message
+        )
+        assert len(clipped.model.sources) == 81 - len(missing)
+        squares.append(square(truth, estimate) / truth.size)
+        whole.append(find_map(posterior, truth))
+    assert abs(np.mean(squares) - 1.0) < 4.0 * 0.065
+    # negative control: of the whole posterior, though it is climbed from the truth, none fits
+    assert not any(estimate.converged for estimate in whole)
+    assert (
+        sum(
+            estimate.at_maximum and square(truth, estimate) < 4.0 * truth.size for estimate in whole
+        )
+        == 0
+    )
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_same_is_left_out_wherever_the_search_begins(seed: int) -> None:
+    posterior, truth, *_ = frame(seed)
+    mine, estimate = reject_outliers(posterior)
+    other, best = reject_outliers(posterior, truth)
+    assert np.array_equal(mine.model.sources.x, other.model.sources.x)
+    assert square(best.params, estimate) < 0.1
+    # negative control: what is left out from a start a quarter of a PSF's width off, before any
+    # climb
+    off = truth.copy()
+    off[: COMPLETE.n_terms] += 0.01 * Field(posterior).scale
+    assert not np.array_equal(clip(posterior, off).posterior.mask, mine.mask)
+    assert np.array_equal(settle(posterior, off)[0].missing, clip(posterior, truth).missing)

@@ -1,0 +1,609 @@
+"""Accidents: kills, interrupts, full disks, other processes at the same file. The chain file is the old one or the new one."""
+
+import contextlib
+import errno
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import emcee
+import h5py
+import numpy as np
+import pytest
+from test_model import make_model, make_posterior, make_truth
+from test_sampling_chain import TOTAL, assert_same_file, draws_of, run
+
+from bayesfred.errors import InputError
+from bayesfred.io.lock import only_writer
+from bayesfred.model import chainfile, sampling
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.sampling.chainfile import Chain, open_chain, random_states, write_chain
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def posterior() -> Posterior:
+    rng = np.random.default_rng(60)
+    model = make_model(tolerance=1e-8)
+    return make_posterior(model, make_truth(model, rng), rng)[0]
+
+
+@pytest.fixture(scope="module")
+def estimate(posterior: Posterior) -> MapEstimate:
+    return find_map(posterior)
+
+
+@pytest.fixture(scope="module")
+def old(
+    posterior: Posterior, estimate: MapEstimate, tmp_path_factory: pytest.TempPathFactory
+) -> Chain:
+    return run(posterior, estimate, tmp_path_factory.mktemp("old") / "chain.h5")
+
+
+@pytest.fixture(scope="module")
+def new(
+    posterior: Posterior, estimate: MapEstimate, tmp_path_factory: pytest.TempPathFactory
+) -> Chain:
+    return run(posterior, estimate, tmp_path_factory.mktemp("new") / "chain.h5", TOTAL + 1)
+
+
+@pytest.fixture
+def path(old: Chain, tmp_path: Path) -> Path:
+    """A finished run's file, to be endangered."""
+    return Path(shutil.copy(old.path, tmp_path))
+
+
+# --- every prefix of a checkpoint -----------------------------------------------------------------
+
+
+class KilledError(BaseException):
+    """The process is dead: nothing after this happens."""
+
+
+class Disk:
+    """The operations of a checkpoint; the one numbered `last` fails, and after a kill so do all that follow."""
+
+    def __init__(
+        self, patch: pytest.MonkeyPatch, error: BaseException | None = None, last: int = 10**9
+    ) -> None:
+        self.error, self.last, self.done = error, last, list[str]()
+        real_open = open
+        for name in ("fsync", "replace", "open", "unlink"):
+            patch.setattr(os, name, self.watched(name, getattr(os, name)))
+        patch.setattr(
+            chainfile,
+            "open",
+            lambda *args: Stream(self, self.watched("create", real_open)(*args)),
+            raising=False,
+        )
+
+    def happen(self, name: str) -> None:
+        if len(self.done) >= self.last and (
+            isinstance(self.error, KilledError) or len(self.done) == self.last
+        ):
+            self.done.append("failed")
+            assert self.error is not None
+            raise self.error
+        self.done.append(name)
+
+    def watched(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def operate(*args: Any, **kwargs: Any) -> Any:
+            self.happen(name)
+            return real(*args, **kwargs)
+
+        return operate
+
+
+class Stream:
+    """A file whose writes can fail halfway."""
+
+    def __init__(self, disk: Disk, real: Any) -> None:
+        self.disk, self.real = disk, real
+
+    def __enter__(self) -> "Stream":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.real.close()
+
+    def write(self, content: memoryview | bytes) -> None:
+        whole = bytes(content)
+        self.real.write(whole[: len(whole) // 2])
+        self.disk.happen("write")
+        self.real.write(whole[len(whole) // 2 :])
+
+    def flush(self) -> None:
+        self.disk.happen("flush")
+        self.real.flush()
+
+    def fileno(self) -> int:
+        return int(self.real.fileno())
+
+
+OPERATIONS = ["unlink", "create", "write", "write", "flush", "fsync", "replace", "open", "fsync"]
+
+
+def test_a_checkpoint_reaches_the_disk_before_it_replaces_the_file(
+    posterior: Posterior, new: Chain, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states, moved = random_states(new.path), replace(new, path=path)
+    with monkeypatch.context() as patch:
+        disk = Disk(patch)
+        write_chain(moved, posterior, states)
+    assert disk.done == OPERATIONS
+    assert_same_file(path, new.path)
+
+
+@pytest.mark.parametrize("last", range(len(OPERATIONS)))
+@pytest.mark.parametrize(
+    "error", [KilledError(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), KeyboardInterrupt()]
+)
+def test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state(
+    posterior: Posterior,
+    old: Chain,
+    new: Chain,
+    path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    last: int,
+    error: BaseException,
+) -> None:
+    states, moved = random_states(new.path), replace(new, path=path)
+    expected = InputError if isinstance(error, OSError) else type(error)
+    with monkeypatch.context() as patch:
+        disk = Disk(patch, error, last)
+        with pytest.raises(expected) as caught:
+            write_chain(moved, posterior, states)
+    assert disk.done[:last] == OPERATIONS[:last]
+    replaced = last > OPERATIONS.index("replace")
+    assert draws_of(open_chain(path)) == draws_of(new if replaced else old)
+    if isinstance(error, OSError):
+        assert "cannot be written (No space left on device)" in str(caught.value)
+    if not isinstance(error, KilledError):
+        assert [p.name for p in path.parent.iterdir()] == ["chain.h5"]
+    write_chain(moved, posterior, states)  # what a killed run left is in nobody's way
+    assert_same_file(path, new.path)
+    assert [p.name for p in path.parent.iterdir()] == ["chain.h5"]
+
+
+def test_a_checkpoint_that_is_not_atomic_fails_that_test(
+    posterior: Posterior, old: Chain, new: Chain, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def in_place(target: Path, content: memoryview) -> None:
+        target.unlink()
+        with chainfile.open(target, "xb") as stream:  # type: ignore[attr-defined]
+            stream.write(content)
+
+    monkeypatch.setattr(chainfile, "_replace", in_place)
+    test_every_prefix = test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state
+    with pytest.raises(InputError, match="no seal"):
+        test_every_prefix(
+            posterior, old, new, path, monkeypatch, 2, KilledError()
+        )  # halfway through its one write
+
+
+# --- kills ----------------------------------------------------------------------------------------
+
+
+def sample_without_end(path: Path, pipe: int) -> None:
+    """Sample with a checkpoint after every step, and tell a pipe how many steps there are once they are saved."""
+    write = sampling.write_chain
+
+    def acknowledged(chain: Chain, *args: Any) -> None:
+        write(chain, *args)
+        os.write(pipe, f"{chain.chain.shape[1]}\n".encode())
+
+    sampling.CHECKPOINT, sampling.CHECKPOINT_SHARE = 0.0, np.inf
+    sampling.write_chain = acknowledged
+    with contextlib.redirect_stdout(None):
+        run(open_chain(path).posterior(), None, path, 10**6, resume=True)
+
+
+def kill_often(path: Path, kills: int, seed: int) -> None:
+    """Kill a sampling process again and again, and print what was found; called in a process that has no threads yet."""
+    chance, found = random.Random(seed), {"unreadable": 0, "lost": 0, "reset": 0, "halfway": 0}
+    temporary = path.with_name(f".{path.name}.tmp")
+    for k in range(kills):
+        before = open_chain(path)
+        ours, theirs = os.pipe()
+        child = os.fork()
+        if child == 0:
+            os.close(ours)
+            try:
+                sample_without_end(path, theirs)
+            finally:
+                os._exit(1)
+        os.close(theirs)
+        acknowledged = os.read(ours, 100)
+        time.sleep(chance.uniform(0.0, 0.1))
+        while k % 2 and not temporary.exists():  # every other time in the middle of a checkpoint
+            time.sleep(1e-4)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        with open(ours, "rb") as rest:
+            acknowledged += rest.read()
+        try:
+            chain = open_chain(path)
+        except InputError:
+            found["unreadable"] += 1
+            break
+        steps, least = chain.chain.shape[1], before.chain.shape[1]
+        found["lost"] += steps < int(acknowledged.split()[-1])
+        found["reset"] += not np.array_equal(chain.chain[:, :least], before.chain)
+        found["halfway"] += temporary.exists()
+    print(json.dumps(found))
+
+
+@pytest.mark.parametrize("kills", [5, pytest.param(100, marks=pytest.mark.long)])
+def test_kills_lose_nothing(
+    posterior: Posterior, estimate: MapEstimate, path: Path, kills: int
+) -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(HERE)!r}); import test_sampling_accidents as t; "
+        "from pathlib import Path; "
+    )
+    code += f"t.kill_often(Path({str(path)!r}), {kills}, 1)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert (found["unreadable"], found["lost"], found["reset"]) == (0, 0, 0)
+    assert found["halfway"] >= kills // 5, "the kills did not meet a checkpoint"
+    survived = open_chain(path)
+    steps = survived.chain.shape[1]
+    assert steps >= TOTAL + kills
+    undisturbed = run(posterior, estimate, path.with_name("undisturbed.h5"), steps)
+    assert draws_of(survived) == draws_of(undisturbed)
+    run(posterior, estimate, path, steps, resume=True)
+    assert_same_file(path, undisturbed.path)
+
+
+# --- interrupts -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("protected", [True, False])
+def test_an_interrupt_while_saving_waits(
+    posterior: Posterior,
+    estimate: MapEstimate,
+    old: Chain,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    protected: bool,
+) -> None:
+    """A Ctrl-C, and another while the steps are saved; without the protection the steps are lost."""
+    path, left, real = tmp_path / "chain.h5", 16, Posterior.unchecked_log_prob
+
+    def stop(self: Posterior, params: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise KeyboardInterrupt
+        return real(self, params)
+
+    def impatient(*args: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        write_chain(*args)
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", stop)
+    monkeypatch.setattr(sampling, "write_chain", impatient)
+    if not protected:
+        monkeypatch.setattr(sampling, "_unbroken", contextlib.nullcontext)
+    with pytest.raises(KeyboardInterrupt):
+        run(posterior, estimate, path)
+    assert path.exists() == protected
+    if protected:
+        assert np.array_equal(open_chain(path).chain, old.chain[:, :6])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_sampling_in_a_thread_takes_no_signals(
+    posterior: Posterior, estimate: MapEstimate, old: Chain, tmp_path: Path
+) -> None:
+    chains: list[Chain] = []
+    thread = threading.Thread(
+        target=lambda: chains.append(run(posterior, estimate, tmp_path / "chain.h5"))
+    )
+    thread.start()
+    thread.join()
+    assert draws_of(chains[0]) == draws_of(old)
+
+
+def test_checkpoints_keep_to_their_share(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a clock on which a step takes 10 and a checkpoint 7: one every 700, never more often than every 30."""
+    now, saved = 0.0, []
+
+    class Clock:
+        @staticmethod
+        def monotonic() -> float:
+            return now
+
+    def save(chain: Chain, *_: Any) -> None:
+        nonlocal now
+        saved.append(now)
+        now += 7.0
+
+    real = Posterior.unchecked_log_prob
+
+    def step(self: Posterior, params: Any) -> Any:
+        nonlocal now
+        now += 5.0  # 2 ensembles, which seldom make more than a call each
+        return real(self, params)
+
+    monkeypatch.setattr(sampling, "time", Clock)
+    monkeypatch.setattr(sampling, "write_chain", save)
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", step)
+    run(posterior, estimate, tmp_path / "chain.h5", 160)
+    assert len(saved) == 4 and 30.0 <= saved[0] < 70.0
+    assert np.all(np.diff(saved[:-1]) >= 700.0)
+
+
+# --- disks ----------------------------------------------------------------------------------------
+
+
+def big(
+    posterior: Posterior, estimate: MapEstimate, path: Path, steps: int, **options: Any
+) -> Chain:
+    """A run whose every step adds 29 kB."""
+    return run(posterior, estimate, path, steps, ensembles=4, walkers=64, **options)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 3 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", disk], capture_output=True, check=False
+    )
+    if made.returncode:
+        pytest.skip("a disk can be mounted by root only")
+    yield disk
+    subprocess.run(["umount", disk], check=True)
+
+
+def test_a_full_disk_says_so_and_loses_nothing(
+    posterior: Posterior,
+    estimate: MapEstimate,
+    small_disk: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = small_disk / "chain.h5"
+    with monkeypatch.context() as patch:
+        patch.setattr(sampling, "CHECKPOINT", 0.0)
+        patch.setattr(sampling, "CHECKPOINT_SHARE", np.inf)
+        with pytest.raises(
+            InputError,
+            match=r"cannot be written \(No space left on device\), expected a disk with room",
+        ):
+            big(posterior, estimate, path, 200)
+    steps = open_chain(path).chain.shape[1]
+    assert 20 < steps < 120
+    assert not list(small_disk.glob("*.tmp"))
+    roomy = Path(shutil.copy(path, tmp_path))
+    big(posterior, estimate, roomy, steps + 3, resume=True)
+    assert_same_file(roomy, big(posterior, estimate, tmp_path / "whole.h5", steps + 3).path)
+
+
+def test_a_file_that_may_not_grow_says_so_and_loses_nothing(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    """The same without a disk to fill: the system's limit on the size of a file."""
+    path = tmp_path / "chain.h5"
+    first = big(posterior, estimate, path, 4)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, hard))
+    try:
+        with pytest.raises(InputError, match=r"cannot be written \(File too large\)"):
+            big(posterior, estimate, path, 8, resume=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert draws_of(open_chain(path)) == draws_of(first)
+    assert big(posterior, estimate, path, 8, resume=True).chain.shape[1] == 8
+
+
+@contextlib.contextmanager
+def without_rights() -> Iterator[None]:
+    """Root may write everywhere, so be somebody else for a moment."""
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        if root:
+            os.seteuid(0)
+
+
+def test_a_read_only_folder_is_refused_before_the_work(
+    posterior: Posterior, old: Chain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "find_map", lambda _: pytest.fail("the maximum was searched for"))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copy(old.path, folder)
+        folder.chmod(0o555)
+        try:
+            with without_rights():
+                for target, options in (
+                    ("chain.h5", {"resume": True}),
+                    ("chain.h5", {"overwrite": True}),
+                    ("other.h5", {}),
+                ):
+                    with pytest.raises(
+                        InputError,
+                        match=r"cannot be written \(Permission denied\), expected a folder that can",
+                    ):
+                        run(posterior, None, folder / target, TOTAL + 1, **options)
+                assert draws_of(open_chain(folder / "chain.h5")) == draws_of(old)
+        finally:
+            folder.chmod(0o755)
+        assert [p.name for p in folder.iterdir()] == ["chain.h5"]
+
+
+# --- others at the same file ----------------------------------------------------------------------
+
+
+def test_a_second_writer_hears_who_the_first_is_before_any_work(
+    posterior: Posterior, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sampling, "find_map", lambda _: pytest.fail("the maximum was searched for"))
+    before = path.read_bytes()
+    with only_writer(path):
+        for options in ({"resume": True}, {"overwrite": True}, {}):
+            with pytest.raises(
+                InputError,
+                match=rf"\(process {os.getpid()} on \S+ since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d\S+\)",
+            ):
+                run(posterior, None, path, TOTAL + 1, **options)
+        (path.parent / ".chain.h5.writer").write_bytes(b"\x1b[31mme\n\xff" + b"x" * 10**6)
+        with pytest.raises(InputError) as caught:
+            run(posterior, None, path, TOTAL + 1, resume=True)
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+    assert path.read_bytes() == before
+
+
+def test_links_at_the_hidden_files_lead_nowhere(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    for suffix in ("tmp", "writer"):
+        (tmp_path / f".chain.h5.{suffix}").symlink_to(precious)
+    assert run(posterior, estimate, tmp_path / "chain.h5").chain.shape[1] == TOTAL
+    assert precious.read_text() == "mine"
+
+
+def test_a_killed_writer_leaves_no_lock(
+    posterior: Posterior, estimate: MapEstimate, path: Path
+) -> None:
+    code = "from pathlib import Path; from bayesfred.io.lock import only_writer; import os, sys\n"
+    code += "with only_writer(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    assert (
+        subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode
+        == -signal.SIGKILL
+    )
+    assert (path.parent / ".chain.h5.writer").exists()
+    assert run(posterior, estimate, path, TOTAL + 1, resume=True).chain.shape[1] == TOTAL + 1
+    assert not (path.parent / ".chain.h5.writer").exists()
+
+
+def test_a_file_that_appeared_meanwhile_is_not_replaced(
+    posterior: Posterior, old: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextlib.contextmanager
+    def waited(path: Path) -> Iterator[None]:
+        with only_writer(path):
+            shutil.copy(old.path, path)  # the other run has ended in the meantime
+            yield
+
+    monkeypatch.setattr(sampling, "only_writer", waited)
+    with pytest.raises(InputError, match="exists, expected a new file"):
+        run(posterior, None, tmp_path / "chain.h5", 2)
+    assert (tmp_path / "chain.h5").read_bytes() == old.path.read_bytes()
+
+
+def attach(posterior: Posterior, path: Path, k: int) -> int:
+    """Attach to a file in one of the ways there are; how many steps were seen."""
+    if k % 4 == 0:
+        with pytest.raises(InputError, match="another process is writing"):
+            run(posterior, None, path, 3, **({"resume": True} if k % 8 else {"overwrite": True}))
+    if k % 4 == 1:
+        backend = emcee.backends.HDFBackend(str(path), name="ensemble_0")
+        emcee.EnsembleSampler(
+            *backend.shape,
+            posterior.log_prob,
+            backend=backend,
+            moves=emcee.moves.DEMove(live_dangerously=True),
+        )
+        return int(backend.iteration)
+    if k % 4 == 2:
+        with h5py.File(path, "r") as file:
+            return len(file["ensemble_0/chain"])
+    return open_chain(path).chain.shape[1]
+
+
+@pytest.mark.parametrize("attaches", [60, pytest.param(1000, marks=pytest.mark.long)])
+def test_readers_and_attaches_disturb_nobody(
+    posterior: Posterior,
+    estimate: MapEstimate,
+    path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    attaches: int,
+) -> None:
+    """A checkpoint after every step, a reader every 10 ms, and others that attach, in 4 threads."""
+    monkeypatch.setattr(sampling, "CHECKPOINT", 0.0)
+    monkeypatch.setattr(sampling, "CHECKPOINT_SHARE", np.inf)
+    seen: list[int] = []
+    errors: list[BaseException] = []
+    waiting, attached = list(range(attaches)), list[int]()
+    stop = threading.Event()
+
+    def guarded(work: Callable[[], object]) -> Callable[[], None]:
+        def guard() -> None:
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+
+        return guard
+
+    def poll() -> None:
+        while not stop.wait(0.01):
+            seen.append(open_chain(path).chain.shape[1])
+
+    def attach_often() -> None:
+        while waiting and not stop.is_set():
+            attached.append(attach(posterior, path, waiting.pop()))
+
+    real = Posterior.unchecked_log_prob
+
+    def until_attached(self: Posterior, params: Any) -> Any:
+        if errors or (len(attached) == attaches and len(seen) > 5):
+            raise KeyboardInterrupt
+        return real(self, params)
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", until_attached)
+    threads = [threading.Thread(target=guarded(work)) for work in (poll, *4 * [attach_often])]
+    started = threading.Event()
+    write = sampling.write_chain
+
+    def begin(*args: Any) -> None:
+        write(*args)
+        if not started.is_set():
+            started.set()
+            for thread in threads:
+                thread.start()
+
+    monkeypatch.setattr(sampling, "write_chain", begin)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(posterior, None, path, 10**5, resume=True)
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+    monkeypatch.undo()
+    assert errors == [] and len(attached) == attaches and min(attached) >= TOTAL
+    assert seen == sorted(seen) and len(set(seen)) > 3
+    steps = open_chain(path).chain.shape[1]
+    assert steps >= seen[-1] > TOTAL
+    assert draws_of(open_chain(path)) == draws_of(
+        run(posterior, estimate, path.with_name("undisturbed.h5"), steps)
+    )

@@ -1,0 +1,730 @@
+"""Runs and their files: resuming, interrupts, damage, and what others can read of them."""
+
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import arviz_stats
+import emcee
+import filelock
+import h5py
+import numba as nb
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import stats
+from test_model import EVERYTHING, make_model, make_posterior, make_truth
+
+from bayesfred.errors import InputError
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.model import ensembles, examine, sampling
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.sampling.chainfile import Chain, fingerprint, open_chain, random_states, write_chain
+from bayesfred.sampling.ensembles import adapted
+from bayesfred.sampling.sampler import burn_in, sample
+
+Floats = NDArray[np.float64]
+
+TOTAL = 12
+
+
+@pytest.fixture(scope="module")
+def posterior() -> Posterior:
+    rng = np.random.default_rng(50)
+    model = make_model(tolerance=1e-8)
+    return make_posterior(model, make_truth(model, rng), rng)[0]
+
+
+@pytest.fixture(scope="module")
+def estimate(posterior: Posterior) -> MapEstimate:
+    return find_map(posterior)
+
+
+def run(
+    posterior: Posterior,
+    estimate: MapEstimate | None,
+    path: Path,
+    steps: int | None = TOTAL,
+    **options: Any,
+) -> Chain:
+    settings: dict[str, Any] = {
+        "seed": 1,
+        "ensembles": 2,
+        "walkers": 8,
+        "progress": False,
+        **options,
+    }
+    return sample(posterior, estimate, path=path, steps=steps, **settings)
+
+
+@pytest.fixture(scope="module")
+def whole(
+    posterior: Posterior, estimate: MapEstimate, tmp_path_factory: pytest.TempPathFactory
+) -> Chain:
+    """A run that nothing disturbed."""
+    return run(posterior, estimate, tmp_path_factory.mktemp("whole") / "chain.h5")
+
+
+def draws_of(chain: Chain) -> Mapping[str, Any]:
+    return {
+        "chain": chain.chain.tobytes(),
+        "log_prob": chain.log_prob.tobytes(),
+        "accepted": chain.accepted.tobytes(),
+    }
+
+
+def assert_same_file(a: Path, b: Path) -> None:
+    """Every dataset and attribute of two HDF5 files is the same, bit by bit."""
+
+    def content(path: Path) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+
+        def add(name: str, item: Any) -> None:
+            found[name] = item[()].tobytes() if isinstance(item, h5py.Dataset) else None
+            found.update(
+                {f"{name}@{key}": np.asarray(value).tolist() for key, value in item.attrs.items()}
+            )
+
+        with h5py.File(path, "r") as file:
+            add("/", file)
+            file.visititems(add)
+        return found
+
+    first, second = content(a), content(b)
+    assert first.keys() == second.keys()
+    assert [key for key in first if first[key] != second[key] and first[key] == first[key]] == []
+
+
+def reseal(path: Path) -> None:
+    """Give a file that was edited the seal that its content asks for, as anybody can."""
+    content = path.read_bytes().rsplit(b"\nbayesfred sha256", 1)[0]
+    path.write_bytes(content + examine.seal(content))
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def test_a_chain_has_the_shapes_it_says(
+    posterior: Posterior, estimate: MapEstimate, whole: Chain
+) -> None:
+    d = posterior.n_parameters
+    assert (
+        whole.chain.shape == (2, TOTAL, 8, d)
+        and whole.log_prob.shape == (2, TOTAL, 8)
+        and whole.accepted.shape == (2, 8)
+    )
+    assert whole.parameter_names == posterior.parameter_names and whole.seed == 1
+    assert (
+        whole.draws().shape == (2 * (TOTAL - whole.burn_in) * 8, d)
+        and 0 <= whole.burn_in <= TOTAL // 2
+    )
+    assert np.array_equal(whole.log_prob[1, -1], posterior.log_prob(whole.chain[1, -1]))
+    moved = np.any(np.diff(whole.chain, axis=1) != 0, axis=-1).sum(axis=1)
+    assert np.all(
+        (whole.accepted == moved) | (whole.accepted == moved + 1)
+    )  # the first step's is not in the chain
+    assert whole.accepted.mean() > 0.7 * TOTAL
+    assert np.array_equal(whole.estimate.params, estimate.params)
+    assert {"bayesfred", "emcee", "numba", "numpy", "scipy", "python"} <= set(whole.versions)
+    assert not np.array_equal(whole.chain[0], whole.chain[1])
+
+
+def test_the_file_gives_the_chain_back(whole: Chain) -> None:
+    again = open_chain(str(whole.path))
+    assert draws_of(again) == draws_of(whole)
+    assert (again.parameter_names, again.burn_in, again.seed) == (
+        whole.parameter_names,
+        whole.burn_in,
+        whole.seed,
+    )
+    assert again.versions == whole.versions and again.estimate.message == whole.estimate.message
+    tree = again.to_datatree()
+    shape = (2 * 8, TOTAL - again.burn_in)
+    assert tree["posterior"]["background"].shape == tree["sample_stats"]["lp"].shape == shape
+    assert np.array_equal(
+        tree["posterior"]["f_ux"].values[8], again.chain[1, again.burn_in :, 0, 0]
+    )
+    assert np.array_equal(
+        tree["sample_stats"]["lp"].values[9], again.log_prob[1, again.burn_in :, 1]
+    )
+
+
+def test_emcee_reads_the_file(whole: Chain) -> None:
+    for k in range(2):
+        backend = emcee.backends.HDFBackend(str(whole.path), name=f"ensemble_{k}", read_only=True)
+        assert (backend.iteration, backend.shape) == (TOTAL, (8, 13))
+        assert np.array_equal(backend.get_chain(), whole.chain[k])
+        assert np.array_equal(backend.get_log_prob(), whole.log_prob[k])
+        assert np.array_equal(backend.accepted, whole.accepted[k])
+        np.random.RandomState().set_state(backend.random_state)
+
+
+def test_resuming_anywhere_changes_no_bit(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    """10 stops at random, on 1 and 2 threads, against one run that never stopped."""
+    total, before = 40, nb.get_num_threads()
+    whole = run(posterior, estimate, tmp_path / "whole.h5", total)
+    stops = np.random.default_rng(52).choice(total - 1, 10, replace=False) + 1
+    try:
+        for threads in range(1, min(2, nb.config.NUMBA_NUM_THREADS) + 1):
+            nb.set_num_threads(threads)
+            for stop in stops:
+                path = tmp_path / f"{threads}-{stop}.h5"
+                run(posterior, estimate, path, int(stop))
+                chain = run(posterior, None, path, total, resume=True)
+                for name in ("chain", "log_prob", "accepted"):
+                    assert np.array_equal(getattr(chain, name), getattr(whole, name)), (
+                        threads,
+                        stop,
+                        name,
+                    )
+                assert_same_file(path, whole.path)
+    finally:
+        nb.set_num_threads(before)
+
+
+def test_arviz_and_netcdf_read_the_chain(whole: Chain, tmp_path: Path) -> None:
+    tree = open_chain(whole.path).to_datatree()
+    tree.to_netcdf(tmp_path / "chain.nc", engine="h5netcdf")
+    with xr.open_datatree(tmp_path / "chain.nc", engine="h5netcdf") as read:
+        assert set(read["posterior"].data_vars) == set(whole.parameter_names)
+        for name in whole.parameter_names:
+            assert np.array_equal(read["posterior"][name], tree["posterior"][name])
+        assert np.array_equal(read["sample_stats"]["lp"], tree["sample_stats"]["lp"])
+        assert float(arviz_stats.ess(read)["background"]) > 10
+
+
+@pytest.mark.parametrize("stops", [(1,), (5,), (11,), (2, 7)])
+def test_a_resumed_run_is_the_uninterrupted_one(
+    posterior: Posterior,
+    estimate: MapEstimate,
+    whole: Chain,
+    tmp_path: Path,
+    stops: tuple[int, ...],
+) -> None:
+    path = tmp_path / "chain.h5"
+    for stop in (*stops, TOTAL):
+        chain = run(posterior, estimate, path, stop, resume=True)
+        assert chain.chain.shape[1] == stop
+    assert draws_of(chain) == draws_of(whole)
+    assert_same_file(path, whole.path)
+
+
+def test_another_state_of_the_random_numbers_is_seen(
+    posterior: Posterior, whole: Chain, tmp_path: Path
+) -> None:
+    """What tests of resuming rest on: it is not enough that the positions are right."""
+    path = tmp_path / "chain.h5"
+    run(posterior, whole.estimate, path, 5)
+    with h5py.File(path, "a") as file:
+        file["ensemble_1"].attrs["random_state_2"] = (
+            file["ensemble_1"].attrs["random_state_2"] + 2
+        ) % 624
+    reseal(path)
+    resumed = run(posterior, None, path, resume=True)
+    assert np.array_equal(resumed.chain[0], whole.chain[0]) and not np.array_equal(
+        resumed.chain[1], whole.chain[1]
+    )
+
+
+def test_a_resumed_run_needs_neither_estimate_nor_the_same_settings(
+    posterior: Posterior, whole: Chain, tmp_path: Path
+) -> None:
+    # the file's own seed, numbers and estimate hold
+    path = tmp_path / "chain.h5"
+    run(posterior, whole.estimate, path, 5)
+    assert draws_of(
+        run(posterior, None, path, resume=True, seed=99, ensembles=3, walkers=10)
+    ) == draws_of(whole)
+
+
+def test_steps_is_a_total(
+    posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path
+) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    for steps in (TOTAL, 3):
+        assert draws_of(run(posterior, estimate, path, steps, resume=True)) == draws_of(whole)
+    assert_same_file(path, whole.path)
+
+
+def test_a_run_to_a_target_resumes_to_the_same_draws(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    options = {"target_ess": 150.0, "walkers": 16}
+    whole = run(posterior, estimate, tmp_path / "a.h5", None, **options)
+    assert 8 <= whole.chain.shape[1] < 60
+    run(posterior, estimate, tmp_path / "b.h5", 7, **options)
+    assert draws_of(
+        run(posterior, estimate, tmp_path / "b.h5", None, resume=True, **options)
+    ) == draws_of(whole)
+    assert draws_of(
+        run(posterior, estimate, tmp_path / "b.h5", None, resume=True, **options)
+    ) == draws_of(whole)
+
+
+@pytest.mark.parametrize("nuisances", [Nuisances(), Nuisances("free")], ids=["fixed", "free"])
+def test_the_seed_alone_makes_the_draws(
+    posterior: Posterior, tmp_path: Path, nuisances: Nuisances
+) -> None:
+    if nb.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one core")
+    posterior = Posterior(posterior.model, posterior.counts, nuisances=nuisances)
+    estimate, before = find_map(posterior), nb.get_num_threads()
+    chains = []
+    try:
+        for threads, seed in ((1, 1), (2, 1), (2, 2)):
+            nb.set_num_threads(threads)
+            chains.append(
+                draws_of(run(posterior, estimate, tmp_path / f"{threads}{seed}.h5", 4, seed=seed))
+            )
+    finally:
+        nb.set_num_threads(before)
+    assert chains[0] == chains[1] != chains[2]
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+def test_an_existing_file_is_refused_or_replaced(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    path = tmp_path / "chain.h5"
+    run(posterior, estimate, path, 2)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="exists, expected a new file"):
+        run(posterior, estimate, path, 2)
+    assert path.read_bytes() == before
+    assert run(posterior, estimate, path, 3, overwrite=True, seed=5).seed == 5
+    with pytest.raises(InputError, match="no folder"):
+        run(posterior, estimate, tmp_path / "absent" / "chain.h5")
+
+
+@pytest.mark.parametrize(
+    ("changed", "change"),
+    [
+        ("counts", lambda p: {"counts": p.counts + np.eye(60, 75)}),
+        ("mask", lambda p: {"mask": np.arange(75) > 2}),
+        ("noise", lambda p: {"noise": PoissonNoise(1.0)}),
+        ("nuisances", lambda p: {"nuisances": Nuisances(footprint=1e4)}),
+        ("prior", lambda p: {"prior": {"background": stats.halfnorm(0, 5.0)}}),
+        ("model", lambda p: {"model": make_model(sigma=2.6, tolerance=1e-8)}),
+        (
+            "model",
+            lambda p: {"model": make_model(SourceCatalog.grid(3, 17.0, 4001.0), tolerance=1e-8)},
+        ),
+        ("model", lambda p: {"model": make_model(tolerance=1e-9)}),
+        ("model", lambda p: {"model": make_model(tolerance=1e-8, conserve_flux=False)}),
+    ],
+)
+def test_another_posterior_is_refused(
+    posterior: Posterior, whole: Chain, tmp_path: Path, changed: str, change: Any
+) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    fields: dict[str, Any] = {
+        "model": posterior.model,
+        "counts": posterior.counts,
+        **change(posterior),
+    }
+    if "mask" in fields:
+        fields["mask"] = np.broadcast_to(fields["mask"], (60, 75))
+    other = Posterior(fields.pop("model"), fields.pop("counts"), **fields)
+    names = [
+        name
+        for name, digest in fingerprint(other).items()
+        if digest != fingerprint(posterior)[name]
+    ]
+    assert changed in names
+    with pytest.raises(InputError, match=f"made with other {', '.join(names)}, expected the same"):
+        run(other, whole.estimate, path, resume=True)
+    assert path.read_bytes() == whole.path.read_bytes()
+
+
+def test_a_second_writer_is_refused(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    with filelock.FileLock(tmp_path / ".chain.h5.lock"):
+        for options in ({"resume": True}, {"overwrite": True}):
+            with pytest.raises(InputError, match="another process is writing"):
+                run(posterior, whole.estimate, path, TOTAL + 1, **options)
+        assert draws_of(open_chain(path)) == draws_of(whole)  # readers do not mind
+    run(posterior, whole.estimate, path, TOTAL + 1, resume=True)
+
+
+@pytest.mark.parametrize(
+    "options", [{"ensembles": 1}, {"walkers": 5}, {"walkers": 2}, {"target_ess": 0.0}, {"steps": 0}]
+)
+def test_numbers_are_checked(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    with pytest.raises(InputError, match=f"sampling: {next(iter(options))}: got"):
+        run(posterior, estimate, tmp_path / "chain.h5", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_estimate_off_the_posterior_is_refused(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    far = MapEstimate(estimate.params - np.eye(13)[12] * 1e3, estimate.covariance, 0.0, True, 1, "")
+    with pytest.raises(InputError, match="estimate: the posterior has no density"):
+        run(posterior, far, tmp_path / "chain.h5")
+
+
+# --- accidents, of which test_sampling_accidents.py has more --------------------------------------
+
+
+CALLS_OF_A_STEP = 2  # one an ensemble, before the first look
+
+
+def spoilt(monkeypatch: pytest.MonkeyPatch, bad: Mapping[int, float], first: int = 2) -> None:
+    """Make the first walker's log-probability something else in the given calls after the walkers are placed."""
+    real, call = Posterior.unchecked_log_prob, -first
+
+    def spoil(self: Posterior, params: Any) -> Any:
+        nonlocal call
+        values = real(self, params)
+        if call in bad:
+            values[0] = bad[call]
+        call += 1
+        return values
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", spoil)
+
+
+@pytest.mark.parametrize("calls", [3, 4, 5, 11, 17])
+def test_an_interrupted_run_keeps_its_complete_steps(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    # 2 calls place the walkers, emcee evaluates none again, and before the first look a step is a
+    # call an ensemble
+    path, real, left = tmp_path / "chain.h5", Posterior.unchecked_log_prob, calls
+
+    def interrupted(self: Posterior, params: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return real(self, params)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Posterior, "unchecked_log_prob", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(posterior, whole.estimate, path)
+    complete = (calls - 2) // 2
+    assert path.exists() == (complete > 0)
+    if complete:
+        kept = open_chain(path)
+        assert np.array_equal(kept.chain, whole.chain[:, :complete])
+    assert not list(tmp_path.glob(".*.tmp"))
+    assert draws_of(run(posterior, whole.estimate, path, resume=True)) == draws_of(whole)
+    assert_same_file(path, whole.path)
+
+
+# --- log-probabilities and walkers that are none --------------------------------------------------
+
+
+def test_what_is_no_density_is_refused_and_counted(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad = {3: math.nan, 7: math.inf, 8: math.nan, 20: math.inf, 21: -math.inf}
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad)
+        chain = run(posterior, whole.estimate, tmp_path / "a.h5")
+    assert chain.n_invalid == open_chain(chain.path).n_invalid == 4 and whole.n_invalid == 0
+    assert np.isfinite(chain.log_prob).all() and np.isfinite(chain.chain).all()
+    assert chain.accepted.sum() < whole.accepted.sum()
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad)
+        run(posterior, whole.estimate, tmp_path / "b.h5", 5)
+    assert open_chain(tmp_path / "b.h5").n_invalid == 3
+    with monkeypatch.context() as patch:
+        spoilt(patch, bad, first=-5 * CALLS_OF_A_STEP)
+        assert draws_of(run(posterior, None, tmp_path / "b.h5", resume=True)) == draws_of(chain)
+    assert_same_file(tmp_path / "b.h5", chain.path)
+
+
+def test_walkers_start_where_there_is_density(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoilt(monkeypatch, {-2: math.inf, -1: math.nan})
+    chain = run(posterior, whole.estimate, tmp_path / "chain.h5", 1)
+    assert chain.n_invalid == 2 and np.isfinite(chain.log_prob).all()
+
+
+def test_an_infinite_prior_density_is_no_density(posterior: Posterior) -> None:
+    undistorted = posterior.start()
+    assert math.isfinite(posterior.log_prob(undistorted))
+    infinite = Posterior(
+        posterior.model, posterior.counts, prior={"f_ux": stats.gamma(0.5)}
+    )  # at 0
+    assert infinite.unchecked_log_prob(undistorted[None])[0] == math.inf
+    assert infinite.log_prob(undistorted) == -math.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda e: {"params": np.where(np.arange(13) == 3, np.nan, e.params)}, "no density around "
+                                                                               "it"),
+        (lambda e: {"params": e.params[:12]}, "got 12 parameters, expected 13"),
+        (lambda e: {"covariance": -e.covariance}, "no positive definite covariance"),
+        (lambda e: {"covariance": np.ones((13, 13))}, "no positive definite covariance"),
+        (lambda e: {"covariance": np.nan * e.covariance}, "no positive definite covariance"),
+        (lambda e: {"covariance": e.covariance[:12]}, "no positive definite covariance"),
+        (lambda e: {"covariance": e.covariance * np.where(np.eye(13)[12] > 0, 1e-40, 1.0)[:, None] ** 0.5
+                    * np.where(np.eye(13)[12] > 0, 1e-40, 1.0) ** 0.5}, "the same background for "
+                                                                        "all walkers"),
+    ],
+)  # fmt: skip
+def test_an_estimate_that_no_run_can_start_from_is_refused(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, change: Any, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        run(posterior, replace(estimate, **change(estimate)), tmp_path / "chain.h5", walkers=32)
+    assert not (tmp_path / "chain.h5").exists()
+
+
+def spoil_last_step(
+    whole: Chain, path: Path, posterior: Posterior, name: str, values: Floats
+) -> None:
+    """A chain file whose last step has other walkers."""
+    array = getattr(whole, name).copy()
+    array[:, -1] = values
+    write_chain(replace(whole, path=path, **{name: array}), posterior, random_states(whole.path))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        (
+            "log_prob",
+            lambda a: np.full_like(a, -np.inf),
+            "16 of 16 walkers without posterior density",
+        ),
+        (
+            "log_prob",
+            lambda a: np.where(np.arange(8) == 2, np.nan, a),
+            "2 of 16 walkers without posterior density",
+        ),
+        (
+            "log_prob",
+            lambda a: np.where(np.arange(8) == 2, np.inf, a),
+            "2 of 16 walkers without posterior density",
+        ),
+        (
+            "chain",
+            lambda a: np.where(np.arange(8)[:, None] == 2, np.nan, a),
+            "2 of 16 walkers without posterior density",
+        ),
+        (
+            "chain",
+            lambda a: np.broadcast_to(a[:, :1], a.shape),
+            "the same f_ux, .* for all walkers",
+        ),
+        (
+            "chain",
+            lambda a: np.repeat(a[:, ::2], 2, axis=1),
+            "spread in 3 directions only, expected 7",
+        ),
+    ],
+)
+def test_a_run_that_cannot_go_on_is_refused(
+    posterior: Posterior, whole: Chain, tmp_path: Path, name: str, change: Any, words: str
+) -> None:
+    path = tmp_path / "chain.h5"
+    spoil_last_step(whole, path, posterior, name, change(getattr(whole, name)[:, -1]))
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=f"start: got .*{words}"):
+        run(posterior, None, path, TOTAL + 1, resume=True)
+    assert path.read_bytes() == before
+
+
+def test_a_stuck_walker_ends_the_run(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One walker claims a density that no proposal has; the run says so, and what was sampled is there."""
+    monkeypatch.setattr(ensembles, "STUCK", 30)
+    path = tmp_path / "chain.h5"
+    spoil_last_step(
+        whole,
+        path,
+        posterior,
+        "log_prob",
+        whole.log_prob[:, -1] + np.array([[1e6] + 7 * [0.0], 8 * [0.0]]),
+    )
+    with pytest.raises(InputError, match="1 of 16 walkers stuck, 30 steps without a move"):
+        run(posterior, None, path, 1000, resume=True)
+    kept = open_chain(path)
+    assert kept.chain.shape[1] == TOTAL + 30
+    assert (
+        np.ptp(kept.chain[0, -31:, 0], axis=0).max()
+        == 0.0
+        < np.ptp(kept.chain[:, -31:, 1], axis=1).min()
+    )
+
+
+def test_an_ensemble_that_accepts_nothing_ends_the_run(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, real, placed = tmp_path / "chain.h5", Posterior.unchecked_log_prob, 2
+
+    def nothing(self: Posterior, params: Any) -> Any:
+        nonlocal placed
+        placed -= 1
+        return real(self, params) if placed >= 0 else np.full(len(params), -np.inf)
+
+    monkeypatch.setattr(Posterior, "unchecked_log_prob", nothing)
+    with pytest.raises(InputError, match="16 of 16 walkers stuck, 125 steps without a move"):
+        run(posterior, estimate, path, None)  # 125 steps of 8 walkers are 1000 proposals
+    assert open_chain(path).chain.shape[1] == 125
+
+
+def damaged(whole: Path, how: str) -> bytes:
+    raw = bytearray(whole.read_bytes())
+    if how == "text":
+        return b"u,v\n1,2\n"
+    if how == "flipped":
+        with h5py.File(whole, "r") as file:
+            raw[file["ensemble_1/chain"].id.get_chunk_info(0).byte_offset + 100] ^= 1
+        return bytes(raw)
+    return bytes(raw[: int(float(how) * len(raw))])
+
+
+@pytest.mark.parametrize("how", ["text", "flipped", "0", "0.01", "0.5", "0.99"])
+def test_damaged_files_are_refused(
+    posterior: Posterior, whole: Chain, tmp_path: Path, how: str
+) -> None:
+    path = tmp_path / "chain.h5"
+    path.write_bytes(damaged(whole.path, how))
+    with pytest.raises(InputError, match=r"chain\.h5: "):
+        open_chain(path)
+    with pytest.raises(InputError, match=r"chain\.h5: "):
+        run(posterior, whole.estimate, path, resume=True)
+
+
+def test_missing_and_foreign_files_are_refused(whole: Chain, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    for absent in (path, tmp_path):
+        with pytest.raises(InputError, match="no such file"):
+            open_chain(absent)
+    with h5py.File(path, "w") as file:
+        file["image"] = np.zeros(3)
+    with pytest.raises(InputError, match="got no seal at the end"):
+        open_chain(path)
+    reseal(path)
+    with pytest.raises(InputError, match="got None of schema None"):
+        open_chain(path)
+    for spoil in ("schema", "kind"):
+        shutil.copy(whole.path, path)
+        with h5py.File(path, "a") as file:
+            file.attrs[spoil] = 99
+        reseal(path)
+        with pytest.raises(InputError, match="expected bayesfred chain of schema"):
+            open_chain(path)
+
+
+@pytest.mark.parametrize(
+    "part", ["estimate", "versions", "ensemble_1", "ensemble_0/chain", "estimate/params"]
+)
+def test_incomplete_files_are_refused(whole: Chain, tmp_path: Path, part: str) -> None:
+    path = tmp_path / "chain.h5"
+    shutil.copy(whole.path, path)
+    with h5py.File(path, "a") as file:
+        del file[part]
+    reseal(path)
+    with pytest.raises(InputError, match=r"chain\.h5: "):
+        open_chain(path)
+
+
+# --- the posterior in the file --------------------------------------------------------------------
+
+POSTERIORS: list[tuple[Nuisances, Any, Detector, bool]] = [
+    (Nuisances(), PoissonNoise(), Detector((60, 75)), True),
+    (Nuisances("scale", footprint=12.5), BackgroundNoise(), Detector((60, 75)), False),
+    (
+        Nuisances("free", psf_sigma=True, background_order=1),
+        PoissonNoise(1.25),
+        Detector((30, 37), 2, "box"),
+        True,
+    ),
+    (EVERYTHING, PoissonNoise(), Detector((20, 25), 3), True),
+]
+
+
+@pytest.mark.parametrize(("nuisances", "noise", "detector", "conserve_flux"), POSTERIORS)
+def test_the_posterior_is_rebuilt(
+    tmp_path: Path, nuisances: Nuisances, noise: Any, detector: Detector, conserve_flux: bool
+) -> None:
+    rng = np.random.default_rng(51)
+    model = make_model(detector=detector, tolerance=1e-8, conserve_flux=conserve_flux)
+    prior = {
+        "f_ux": stats.t(4.0, 0.0, 1e-3),
+        "background": stats.gamma(2.0, scale=3.0),
+        "g_uy": stats.uniform(-1e-2, 2e-2),
+    }
+    mask = rng.random(detector.shape) < 0.9
+    options = {"nuisances": nuisances, "noise": noise, "prior": prior, "mask": mask}
+    posterior, truth = make_posterior(model, make_truth(model, rng), rng, **options)
+    covariance = np.linalg.inv(posterior.information(truth))
+    estimate = MapEstimate(
+        truth, 0.5 * (covariance + covariance.T), posterior.log_prob(truth), True, 1, "the truth"
+    )
+    chain = run(posterior, estimate, tmp_path / "chain.h5", 2)
+    again = open_chain(chain.path).posterior()
+    points = chain.chain[:, -1].reshape(-1, truth.size)
+    assert again.log_prob(points).tobytes() == posterior.log_prob(points).tobytes()
+    assert np.isfinite(again.log_prob(points)).all() and math.isfinite(again.log_prob(truth))
+    assert np.array_equal(again.gradient(truth), posterior.gradient(truth), equal_nan=True)
+    assert (again.parameter_names, again.noise, again.nuisances) == (
+        posterior.parameter_names,
+        noise,
+        nuisances,
+    )
+    assert fingerprint(again) == fingerprint(posterior)
+
+
+@pytest.mark.parametrize("effective", [0.0, 1e-15, 1e-3])
+def test_walkers_that_hardly_move_leave_half_the_run_out(
+    monkeypatch: pytest.MonkeyPatch, effective: float
+) -> None:
+    """However long the correlation is; 1/effective overflows no logarithm."""
+    monkeypatch.setattr(sampling, "bulk_sizes", lambda _: np.full(2, effective))
+    assert burn_in(np.random.default_rng(1).standard_normal((4, 80, 8, 2))) == 40
+
+
+@pytest.mark.parametrize(("tau", "left_out"), [(1.0, 0), (1.2, 1), (3.0, 4), (9.0, 13)])
+def test_the_first_step_that_is_kept_has_forgotten_the_start(
+    monkeypatch: pytest.MonkeyPatch, tau: float, left_out: int
+) -> None:
+    chain = np.random.default_rng(1).standard_normal((4, 80, 8, 2))
+    monkeypatch.setattr(sampling, "bulk_sizes", lambda kept: np.full(2, kept[..., 0].size / tau))
+    r = (tau - 1.0) / (tau + 1.0)
+    assert burn_in(chain) == left_out and r ** (left_out + 1) <= 0.05 < max(r, 1e-9) ** left_out
+
+
+def test_differential_evolution_begins_after_the_first_look(
+    posterior: Posterior, whole: Chain
+) -> None:
+    shares = [
+        {
+            type(move): share
+            for move, share in ensembles._moves(posterior, whole.estimate, whole.chain[:, :n])
+        }[emcee.moves.DEMove]
+        for n in (0, 1, 7, 8, 12)
+    ]
+    assert adapted(whole.chain) == 0 and shares == [
+        0.0,
+        0.0,
+        0.0,
+        ensembles.DE_SHARE,
+        ensembles.DE_SHARE,
+    ]
