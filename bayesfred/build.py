@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bayesfred import settings
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError, printable
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
@@ -17,8 +17,6 @@ from bayesfred.io import files
 from bayesfred.model import priors
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.model.posterior import Nuisances, Posterior
-
-Floats = npt.NDArray[np.float64]
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
 # deviations of a term's default prior. Sources whose light is farther from the frame than that are
@@ -107,7 +105,7 @@ def posterior_given(
     run: settings.RunSettings,
     model: ForwardModel,
     counts: Floats,
-    mask: npt.NDArray[np.bool_] | None,
+    mask: Flags | None,
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
     n = run.nuisances

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bayesfred import build, settings
+from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis import comparison
 from bayesfred.analysis import verify as verification
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
@@ -31,9 +31,6 @@ from bayesfred.optimize.find_map import MapEstimate, reject_outliers
 from bayesfred.reporting import html, plots
 from bayesfred.sampling.chainfile import Chain, open_chain
 from bayesfred.sampling.sampler import sample, searching, versions
-
-Floats = npt.NDArray[np.float64]
-PathLike = str | os.PathLike[str]
 
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from arviz_stats.base import array_stats
-from numpy.typing import NDArray
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chainfile import Chain
@@ -31,7 +31,6 @@ from bayesfred.sampling.convergence import convergence
 
 __all__ = ["Comparison", "Score", "compare"]
 
-Floats = NDArray[np.float64]
 
 # Pixels whose log-likelihood varies by less over the draws need no smoothing.
 SPREAD = 0.5

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 
 import arviz_base
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from bayesfred._typing import Floats
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chainfile import Chain
@@ -156,7 +156,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
     )
 
 
-def autocorrelation_time(series: NDArray[np.float64], window: float = 5.0) -> float:
+def autocorrelation_time(series: Floats, window: float = 5.0) -> float:
     """Integrated autocorrelation time by Sokal's window.
 
     1 + 2 sum rho_t up to the first lag M >= window tau(M), with the autocorrelation pooled over
@@ -182,9 +182,7 @@ def autocorrelation_time(series: NDArray[np.float64], window: float = 5.0) -> fl
     return float(tau[closed[0] if closed.size else -1])
 
 
-def _sensitivities(
-    chain: Chain, posterior: Posterior
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats]:
     """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
     names = chain.parameter_names
     draws = (
@@ -195,9 +193,7 @@ def _sensitivities(
     return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
 
 
-def _sensitivity(
-    names: tuple[str, ...], draws: NDArray[np.float64], log_part: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Floats:
     """Sensitivity of every parameter to that factor of the posterior whose logarithm at the draws is given, shape (d,)."""
     from arviz_stats import (
         psense,
@@ -222,13 +218,13 @@ def _sensitivity(
     return np.array([float(sensitivity[name]) for name in names])
 
 
-def _by_name(names: tuple[str, ...], values: NDArray[np.float64]) -> dict[str, float]:
+def _by_name(names: tuple[str, ...], values: Floats) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
 def _verdict(
-    rhat: NDArray[np.float64],
-    ess: NDArray[np.float64],
+    rhat: Floats,
+    ess: Floats,
     acceptance: float,
     chain: Chain,
     target_ess: float,

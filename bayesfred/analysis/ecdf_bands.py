@@ -14,12 +14,11 @@ T. Saeilynoja, P.-C. Buerkner, A. Vehtari (2022), Statistics and Computing 32, 3
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import gammaln, xlogy
 from scipy.stats import binom
 
-Floats = NDArray[np.float64]
+from bayesfred._typing import Floats
 
 __all__ = ["band", "ecdf", "points", "uniformity"]
 

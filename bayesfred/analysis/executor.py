@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -35,13 +34,12 @@ from rich.progress import (
 )
 from threadpoolctl import threadpool_limits
 
+from bayesfred._typing import PathLike
 from bayesfred.errors import InputError, printable
 from bayesfred.io import files
 from bayesfred.io.lock import only_writer
 from bayesfred.model.posterior import one_thread
 from bayesfred.sampling.sampler import versions
-
-Floats = npt.NDArray[np.float64]
 
 WAITING = 4  # tasks sent ahead for each worker that is known
 
@@ -104,7 +102,7 @@ def run(
     study: Study,
     n: int,
     *,
-    path: str | os.PathLike[str],
+    path: PathLike,
     meta: Mapping[str, Any],
     executor: Executor | None,
     workers: int | None,

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.analysis.executor import Executor, run
 from bayesfred.analysis.study_helpers import (
     LEVELS,
@@ -34,8 +34,6 @@ from bayesfred.optimize.find_map import inverse
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chainfile import fingerprint
 
-Floats = npt.NDArray[np.float64]
-
 __all__ = ["NoiseStudy", "noise_study"]
 
 VARIABLES = ("background", "flux", "sources", "psf_sigma", "exposure")
@@ -54,7 +52,7 @@ class _Levels:
     noise: PoissonNoise | BackgroundNoise
     nuisances: Nuisances
     prior: Mapping[str, Any] | None
-    mask: npt.NDArray[np.bool_] | None
+    mask: Flags | None
     seed: int
 
     @property
@@ -200,7 +198,7 @@ def noise_study(
     nuisances: Nuisances = Nuisances(),
     prior: Mapping[str, Any] | None = None,
     mask: npt.ArrayLike | None = None,
-    path: str | os.PathLike[str],
+    path: PathLike,
     seed: int,
     executor: Executor | None = None,
     workers: int | None = None,

@@ -11,7 +11,6 @@ log-likelihood).
 """
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erfc
 
+from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.ecdf_bands import uniformity
 from bayesfred.analysis.executor import Executor, run
 from bayesfred.analysis.study_helpers import (
@@ -38,8 +38,6 @@ from bayesfred.analysis.study_helpers import (
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chainfile import fingerprint
-
-Floats = npt.NDArray[np.float64]
 
 __all__ = ["PosteriorCalibration", "calibrate_posterior"]
 
@@ -179,7 +177,7 @@ def calibrate_posterior(
     fitted: Posterior | None = None,
     replicates: int = 1000,
     method: Method = "mcmc",
-    path: str | os.PathLike[str],
+    path: PathLike,
     seed: int,
     executor: Executor | None = None,
     workers: int | None = None,

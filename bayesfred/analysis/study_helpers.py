@@ -4,8 +4,8 @@ import math
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import MapEstimate, find_map
@@ -13,7 +13,6 @@ from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.ensembles import advance, begin, check_start
 from bayesfred.sampling.sampler import burn_in
 
-Floats = npt.NDArray[np.float64]
 Method = Literal["laplace", "mcmc"]
 
 LEVELS = (0.68, 0.95)  # of the intervals whose coverage is counted
@@ -92,7 +91,7 @@ def coverage_error(level: float, n: int) -> float:
     return math.sqrt(level * (1.0 - level) / max(n, 1))
 
 
-def covered(pit: Floats, level: float) -> npt.NDArray[np.bool_]:
+def covered(pit: Floats, level: float) -> Flags:
     """Whether the central interval of a probability holds the truth."""
     return np.abs(pit - 0.5) <= 0.5 * level
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import solve_triangular
 from threadpoolctl import threadpool_limits
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.io.hdf5_checks import stated_digest
 from bayesfred.model.posterior import Posterior
@@ -20,8 +20,6 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chainfile import Chain, changed_parts, fingerprint, open_chain
 from bayesfred.sampling.ensembles import advance, begin
 from bayesfred.sampling.moves import LaplaceMove
-
-Floats = npt.NDArray[np.float64]
 
 DRAWS = 1000  # whose log-probability is computed again, unless all are
 STEPS = 10  # made again from the seed

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +39,9 @@ class SourceCatalog:
     2
     """
 
-    x: FloatArray
-    y: FloatArray
-    flux: FloatArray
+    x: Floats
+    y: Floats
+    flux: Floats
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "flux"):
@@ -111,7 +109,7 @@ class SourceCatalog:
         return cls(*(np.asarray(group[name]) for name in ("x", "y", "flux")))
 
 
-def _column(name: str, values: object) -> FloatArray:
+def _column(name: str, values: object) -> Floats:
     """Make a read-only float64 copy of one column, or raise an InputError that names it."""
     try:
         column = np.array(values, dtype=np.float64)

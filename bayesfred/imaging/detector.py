@@ -16,13 +16,12 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_toeplitz, toeplitz
 from scipy.special import sici
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 PIXELS = ("impulse", "box")
 
@@ -88,7 +87,7 @@ class Detector:
         """Fine pixels of the frame, (ny * binning, nx * binning)."""
         return self.shape[0] * self.binning, self.shape[1] * self.binning
 
-    def pixel_centres(self) -> tuple[FloatArray, FloatArray]:
+    def pixel_centres(self) -> tuple[Floats, Floats]:
         """Centres of the recorded pixels, u of every column and v of every row.
 
         Returns
@@ -106,7 +105,7 @@ class Detector:
         ny, nx = self.shape
         return _centred(nx) * self.binning, _centred(ny) * self.binning
 
-    def quadrature(self, sigma: float, beta: float = math.inf) -> tuple[FloatArray, FloatArray]:
+    def quadrature(self, sigma: float, beta: float = math.inf) -> tuple[Floats, Floats]:
         """Points and weights along one axis whose sum gives a recorded pixel; the same rule serves both axes.
 
         Parameters
@@ -159,7 +158,7 @@ class Detector:
         return cls((ny, nx), int(group.attrs["binning"]), bytes(group.attrs["pixel"]).decode())
 
 
-def _centred(n: int) -> FloatArray:
+def _centred(n: int) -> Floats:
     """0 ... n - 1 counted from their middle."""
     return np.asarray(np.arange(n) - (n - 1) / 2.0, dtype=np.float64)
 
@@ -194,7 +193,7 @@ def _box_order(width: float, beta: float) -> int:
     return order
 
 
-def sampling_matrix(n: int) -> FloatArray:
+def sampling_matrix(n: int) -> Floats:
     """Build the paper's matrix R: what integration over pixels makes of impulse samples along one axis.
 
     A band-limited image is the sum over m of I_m sinc(u - m) (Whittaker-Shannon; sinc t is sin(pi
@@ -235,7 +234,7 @@ def sampling_matrix(n: int) -> FloatArray:
     return np.asarray(toeplitz(_sampling_column(int(n))), dtype=np.float64)
 
 
-def correct_sampling(frame: ArrayLike) -> FloatArray:
+def correct_sampling(frame: ArrayLike) -> Floats:
     """Turn a frame of pixel integrals into impulse samples at the pixels' centres: R^-1 I R^-1.
 
     R is `sampling_matrix` of each axis' length; a Toeplitz solver stands for the inverse. The
@@ -275,7 +274,7 @@ def correct_sampling(frame: ArrayLike) -> FloatArray:
     )
 
 
-def _sampling_column(n: int) -> FloatArray:
+def _sampling_column(n: int) -> Floats:
     """First column of R, r_0 ... r_(n-1)."""
     edges, _ = sici(np.pi * (np.arange(n + 1) - 0.5))
     return np.asarray(np.diff(edges) / np.pi, dtype=np.float64)

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 
-FloatArray = NDArray[np.float64]
 Exponents = tuple[int, int, int, int]
 
 X, Y, U, V = range(4)  # a variable's place in an exponent tuple (i, j, m, n)
@@ -162,7 +162,7 @@ class PolynomialDistortion:
 
     def displacement(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Floats, Floats]:
         """Evaluate f and g.
 
         Parameters
@@ -195,7 +195,7 @@ class PolynomialDistortion:
 
     def determinant(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> FloatArray:
+    ) -> Floats:
         """Jacobian determinant D = (1 + f_u)(1 + g_v) - f_v g_u of (a, b) with respect to (u, v).
 
         |D| is the factor that makes the kernel integrate to one over (u, v); where D changes sign
@@ -211,9 +211,7 @@ class PolynomialDistortion:
         g_u, g_v = (_polynomial(g_theta, self.g_terms, point, along) for along in (U, V))
         return np.asarray((1.0 + f_u) * (1.0 + g_v) - f_v * g_u)
 
-    def image_position(
-        self, theta: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
+    def image_position(self, theta: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Where the image of an object point stands: the (u, v) with u - x + f = 0 and v - y + g = 0.
 
         Newton's method with the analytic derivatives, from (u, v) = (x, y).
@@ -244,7 +242,7 @@ class PolynomialDistortion:
         f_theta, g_theta = self._split(theta)
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
 
-        def residual(u: FloatArray, v: FloatArray) -> tuple[FloatArray, ...]:
+        def residual(u: Floats, v: Floats) -> tuple[Floats, ...]:
             point = (x, y, u, v)
             return (
                 u - x + _polynomial(f_theta, self.f_terms, point),
@@ -259,7 +257,7 @@ class PolynomialDistortion:
 
     def object_position(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Floats, Floats]:
         """Which object point is imaged at (u, v): the inverse of `image_position`, solved the same way.
 
         Parameters
@@ -282,7 +280,7 @@ class PolynomialDistortion:
         f_theta, g_theta = self._split(theta)
         u, v = np.broadcast_arrays(np.asarray(u, dtype=float), np.asarray(v, dtype=float))
 
-        def residual(x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
+        def residual(x: Floats, y: Floats) -> tuple[Floats, ...]:
             point = (x, y, u, v)
             return (
                 u - x + _polynomial(f_theta, self.f_terms, point),
@@ -305,7 +303,7 @@ class PolynomialDistortion:
         """Rebuild what `write` stored; InputError if the stored terms are not valid."""
         return cls(np.asarray(group["f_terms"]).tolist(), np.asarray(group["g_terms"]).tolist())
 
-    def _split(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def _split(self, theta: ArrayLike) -> tuple[Floats, Floats]:
         """Theta's two halves, those of f and of g, after a check of its shape."""
         values = np.asarray(theta, dtype=float)
         if values.shape != (self.n_terms,):
@@ -360,17 +358,17 @@ def _term_name(letter: str, term: Sequence[int]) -> str:
     return f"{letter}_{''.join(written) or '1'}"
 
 
-def _point(u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, ...]:
+def _point(u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Floats, ...]:
     """Broadcast the four coordinates, in the order of an exponent tuple."""
     return np.broadcast_arrays(*(np.asarray(value, dtype=float) for value in (x, y, u, v)))
 
 
 def _polynomial(
-    theta: FloatArray,
+    theta: Floats,
     terms: Sequence[Sequence[int]],
-    point: tuple[FloatArray, ...],
+    point: tuple[Floats, ...],
     along: int | None = None,
-) -> FloatArray:
+) -> Floats:
     """Sum theta x^i y^j u^m v^n over the terms, or its derivative along one of the four variables."""
     total = np.zeros(point[0].shape)
     for coefficient, term in zip(theta, terms, strict=True):
@@ -389,10 +387,10 @@ def _polynomial(
 
 
 def _newton(
-    residual: Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]],
-    p: FloatArray,
-    q: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+    residual: Callable[[Floats, Floats], tuple[Floats, ...]],
+    p: Floats,
+    q: Floats,
+) -> tuple[Floats, Floats]:
     """Solve two equations at every point, from (p, q).
 
     `residual` gives (r, s, r_p, r_q, s_p, s_q); a step is Cramer's rule on [[r_p, r_q], [s_p,

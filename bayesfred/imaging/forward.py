@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
@@ -26,8 +27,6 @@ from bayesfred.imaging.kernels.jacobian import Basis, jacobian
 from bayesfred.imaging.kernels.render import image
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import FWHM, PSF, read_psf
-
-Floats = npt.NDArray[np.float64]
 
 # An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2):
 # 1 % at this width.

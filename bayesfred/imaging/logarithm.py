@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class LogDistortion:
 
     def displacement(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Floats, Floats]:
         """Evaluate f and g, pixel; the arguments are those of `PolynomialDistortion.displacement`."""
         u, v, x, y = (np.asarray(value, dtype=np.float64) for value in (u, v, x, y))
         logarithm = np.log1p(self.c * (u**2 + v**2))
@@ -61,14 +60,12 @@ class LogDistortion:
 
     def determinant(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> FloatArray:
+    ) -> Floats:
         """Jacobian determinant D = (1 + f_u)(1 + g_v) - f_v g_u, in which f_u g_v and f_v g_u cancel."""
         u, v, x, y = (np.asarray(value, dtype=np.float64) for value in (u, v, x, y))
         return np.asarray(1.0 + 2.0 * self.c * (x * u + y * v) / (1.0 + self.c * (u**2 + v**2)))
 
-    def image_position(
-        self, theta: ArrayLike, x: ArrayLike, y: ArrayLike
-    ) -> tuple[FloatArray, FloatArray]:
+    def image_position(self, theta: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Where the image of an object point stands: on the same radius, at rho = r (1 - log(1 + c rho^2)) from the axis."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         r = np.hypot(x, y)

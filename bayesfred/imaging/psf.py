@@ -19,10 +19,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, ndimage, special
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.kernels.psf_profiles import Gaussian, Moffat, Spline
-
-Floats = npt.NDArray[np.float64]
 
 FWHM = math.sqrt(8.0 * math.log(2.0))  # of a Gaussian of unit width
 LARGEST_BETA = 100.0  # beyond, (1 + x)^-beta loses digits, and is a Gaussian to 1 %

@@ -28,6 +28,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import ArrayLike, NDArray
 
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError, printable
 
 __all__ = [
@@ -68,8 +69,8 @@ class FrameRecord:
         One line: the file, its shape, how many pixels are masked and why.
     """
 
-    counts: NDArray[np.float64]
-    valid: NDArray[np.bool_]
+    counts: Floats
+    valid: Flags
     n_masked: int
     description: str
 
@@ -86,9 +87,9 @@ class CatalogueRecord:
         Expected counts of each source over the whole of its image.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    flux: NDArray[np.float64]
+    x: Floats
+    y: Floats
+    flux: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -586,7 +587,7 @@ class _Stream(io.BufferedReader):
         return super().seek(min(offset, os.fstat(self.fileno()).st_size), whence)
 
 
-def _read_fits(path: Path, name: str | None) -> NDArray[np.float64]:
+def _read_fits(path: Path, name: str | None) -> Floats:
     seen = []
     with _readable(path, "FITS"), warnings.catch_warnings():
         # Warnings are about headers; data that are cut short raise.
@@ -615,7 +616,7 @@ def _read_fits(path: Path, name: str | None) -> NDArray[np.float64]:
     raise InputError(f"{path}: got {', '.join(seen) or 'no image'}, expected {wanted}")
 
 
-def _read_hdf5(path: Path, name: str | None) -> NDArray[np.float64]:
+def _read_hdf5(path: Path, name: str | None) -> Floats:
     key = name or "counts"
     with _readable(path, "HDF5"), h5py.File(path, "r") as file:
         dataset = file.get(key)
@@ -634,7 +635,7 @@ def _read_hdf5(path: Path, name: str | None) -> NDArray[np.float64]:
         return np.asarray(dataset[()], dtype=np.float64)
 
 
-def _read_npy(path: Path, name: str | None) -> NDArray[np.float64]:
+def _read_npy(path: Path, name: str | None) -> Floats:
     if name is not None:
         raise InputError(
             f"{path}: got name {name!r}, expected none, as an NPY file holds one array"
@@ -648,15 +649,15 @@ def _read_npy(path: Path, name: str | None) -> NDArray[np.float64]:
         return np.array(stored, dtype=np.float64)
 
 
-_READERS: dict[str, Callable[[Path, str | None], NDArray[np.float64]]] = {
+_READERS: dict[str, Callable[[Path, str | None], Floats]] = {
     "FITS": _read_fits,
     "HDF5": _read_hdf5,
     "NPY": _read_npy,
 }
 
 
-def _require_counts(path: Path, counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    whole: NDArray[np.float64] = np.rint(counts) + 0.0  # + 0.0 turns -0.0 into 0.0
+def _require_counts(path: Path, counts: Floats) -> Floats:
+    whole: Floats = np.rint(counts) + 0.0  # + 0.0 turns -0.0 into 0.0
     bad = (np.abs(counts - whole) > 1e-9) | (whole < 0)
     _refuse(
         path, counts, bad, "counts (whole numbers, not negative); give gain (e-/adu) and pedestal"
@@ -664,7 +665,7 @@ def _require_counts(path: Path, counts: NDArray[np.float64]) -> NDArray[np.float
     return whole
 
 
-def _refuse(path: Path, counts: NDArray[np.float64], bad: NDArray[np.bool_], expected: str) -> None:
+def _refuse(path: Path, counts: Floats, bad: Flags, expected: str) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise InputError(
@@ -673,7 +674,7 @@ def _refuse(path: Path, counts: NDArray[np.float64], bad: NDArray[np.bool_], exp
         )
 
 
-def _column(path: Path, table: Table, name: str) -> NDArray[np.float64]:
+def _column(path: Path, table: Table, name: str) -> Floats:
     if name not in table.colnames:
         present = ", ".join(map(repr, table.colnames))
         raise InputError(

@@ -9,15 +9,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.model.kernels.clusters import Clusters
 from bayesfred.model.kernels.extrapolate import Extrapolated, describe
 from bayesfred.model.kernels.fluxes import Fitted
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class FluxExtrapolation(NamedTuple):

@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import gammaln, xlogy
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.kernels.likelihood import GAUSSIAN, POISSON
-
-Floats = npt.NDArray[np.float64]
 
 NOTHING = 1e-300  # stands for an expected count of zero, at which nothing but zero can be counted
 

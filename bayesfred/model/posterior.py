@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import gammaln
 
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
@@ -40,7 +41,6 @@ from bayesfred.model.kernels.likelihood import (
 )
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, read_noise_model
 
-Floats = npt.NDArray[np.float64]
 FluxMode = Literal["fixed", "scale", "free"]
 
 BACKGROUND_TERMS = (
@@ -200,7 +200,7 @@ def _usable(
     mask: npt.ArrayLike | None,
     noise: PoissonNoise | BackgroundNoise,
     nuisances: Nuisances,
-) -> npt.NDArray[np.bool_]:
+) -> Flags:
     """The pixels for the likelihood, after checking that the frame can be explained at all."""
     shape = model.detector.shape
     used = np.ones(shape, bool) if mask is None else np.array(mask, dtype=bool)
@@ -236,7 +236,7 @@ def _usable(
     return used
 
 
-def _footprint(model: ForwardModel, radius: float) -> npt.NDArray[np.bool_]:
+def _footprint(model: ForwardModel, radius: float) -> Flags:
     """Pixels within `radius` of a source's catalogue position."""
     u, v = model.detector.pixel_centres()
     inside = np.zeros((v.size, u.size), bool)
@@ -298,7 +298,7 @@ class Posterior:
     counts: Floats
     prior: Mapping[str, Any]
     noise: PoissonNoise | BackgroundNoise
-    mask: npt.NDArray[np.bool_]
+    mask: Flags
     nuisances: Nuisances
 
     _extrapolation: ClassVar[FluxExtrapolation | None] = None

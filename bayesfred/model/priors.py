@@ -11,16 +11,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import stats
 from scipy.special import xlogy
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.logarithm import LogDistortion
-
-Floats = npt.NDArray[np.float64]
 
 # log p up to a constant, d log p / dz and -d^2 log p / dz^2 in the standardised z = (x - loc) /
 # scale; s are the shape parameters.

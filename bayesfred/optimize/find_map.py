@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model import priors
 from bayesfred.model.posterior import Posterior
@@ -16,8 +16,6 @@ from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.optimize.matching import Start, find_start, other_starts
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import Clipped, settle, whole
-
-Floats = npt.NDArray[np.float64]
 
 # A combination of parameters about which the frame adds less than this share to its prior's
 # information is not measured.

@@ -31,11 +31,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.special import xlogy
 from scipy.stats import poisson
 
+from bayesfred._typing import Floats
 from bayesfred.model.noise import BackgroundNoise
 from bayesfred.model.posterior import Posterior
 
@@ -45,8 +45,8 @@ BLOCK = 2**16  # pixels
 
 
 def deviance_moments(
-    mu: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    mu: Floats,
+) -> tuple[Floats, Floats, Floats]:
     """Mean, variance and the mean's slope of the unit deviance of a Poisson count.
 
     The unit deviance is D(n; mu) = 2 (n log(n / mu) - n + mu), n ~ Poisson(mu). Its covariance with
@@ -100,7 +100,7 @@ def _deviance_table() -> CubicSpline:
     return CubicSpline(np.log(grid), np.log(moments))
 
 
-def fit_statistics(posterior: Posterior, params: NDArray[np.float64]) -> dict[str, Any]:
+def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     """The numbers that judge a fit, by the names that `Diagnostics` gives them."""
     used = posterior.mask
     n = posterior.counts[used]

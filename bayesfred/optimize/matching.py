@@ -23,9 +23,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg, ndimage, spatial
 
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import image_positions
@@ -33,10 +33,6 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.newton import maximize
 from bayesfred.optimize.outliers import COARSE, STEPS, clip, vertex
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 SIGNIFICANCE = 4.0  # of a peak, in standard deviations of the filtered frame
 CENTROID = 0.2  # error of a peak's position that is taken for granted, in PSF widths

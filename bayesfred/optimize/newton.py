@@ -13,12 +13,10 @@ points out of it.
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg, optimize
 
+from bayesfred._typing import Floats
 from bayesfred.model.posterior import Posterior
-
-Floats = npt.NDArray[np.float64]
 
 # standard deviations from the maximum, where log_prob differs from it by 5e-8; sums over frames
 # round at 1e-9

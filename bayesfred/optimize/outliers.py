@@ -22,19 +22,15 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage, spatial
 
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import image_positions
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.newton import maximize
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 # of what is left out, in standard deviations; so it has this number's square of counts at least
 SIGNIFICANCE = 5.0

@@ -17,8 +17,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.errors import printable
 from bayesfred.model.posterior import Posterior
@@ -26,8 +26,6 @@ from bayesfred.reporting import plots
 from bayesfred.sampling.chainfile import Chain
 
 __all__ = ["write_report"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class _Statistic:
 
 
 def write_report(
-    path: str | os.PathLike[str],
+    path: PathLike,
     *,
     title: str,
     chain: Chain,

@@ -24,8 +24,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
-from numpy.typing import NDArray
 
+from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.ecdf_bands import band, ecdf, points
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
@@ -72,9 +72,6 @@ VARIABLE_LABELS = {
     "psf_sigma": "PSF sigma / pixel",
     "exposure": "exposure / the model's",
 }
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def parameter_powers(name: str) -> tuple[str, tuple[tuple[str, int], ...]] | None:
@@ -271,7 +268,7 @@ def trace_plot(chain: Chain) -> Figure:
     return fig
 
 
-def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> Figure:
+def frame_triptych(counts: Floats, expected: Floats, sigma: Floats, mask: Flags) -> Figure:
     """The frame, the model on the same scale, and their difference in standard deviations.
 
     Parameters
@@ -295,7 +292,7 @@ def star_panels(
     counts: Floats,
     expected: Floats,
     sigma: Floats,
-    mask: Mask,
+    mask: Flags,
     u: Floats,
     v: Floats,
     *,
@@ -383,7 +380,7 @@ def overview(
     counts: Floats,
     expected: Floats,
     sigma: Floats,
-    mask: Mask,
+    mask: Flags,
     draws: Floats,
     names: Sequence[str],
     *,
@@ -676,7 +673,7 @@ def _quantity(name: str) -> str:
 
 
 def _draw_triptych(
-    fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Mask
+    fig: Figure, axes: Sequence[Axes], counts: Floats, expected: Floats, sigma: Floats, mask: Flags
 ) -> None:
     """Frame, model and residual on three axes; the first two share a colour bar."""
     ny, nx = counts.shape
@@ -719,12 +716,12 @@ def _show(
     )
 
 
-def _recorded(counts: Floats, mask: Mask) -> Floats:
+def _recorded(counts: Floats, mask: Flags) -> Floats:
     """The frame, nan where a pixel was masked because it holds no counts."""
     return np.where(mask | (counts != 0.0), counts, np.nan)
 
 
-def _residual(counts: Floats, expected: Floats, sigma: Floats, mask: Mask) -> Floats:
+def _residual(counts: Floats, expected: Floats, sigma: Floats, mask: Flags) -> Floats:
     """Residual in standard deviations; nan outside the mask."""
     out = np.full(counts.shape, np.nan)
     out[mask] = (counts[mask] - expected[mask]) / sigma[mask]

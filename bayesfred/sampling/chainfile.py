@@ -21,15 +21,13 @@ from typing import Any
 import arviz_base
 import h5py
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
+from bayesfred._typing import Floats, Ints, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import MapEstimate
-
-Floats = npt.NDArray[np.float64]
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
@@ -67,7 +65,7 @@ class Chain:
     parameter_names: tuple[str, ...]
     chain: Floats
     log_prob: Floats
-    accepted: npt.NDArray[np.int64]
+    accepted: Ints
     burn_in: int
     seed: int
     estimate: MapEstimate
@@ -95,7 +93,7 @@ class Chain:
             return Posterior.read(file["posterior"])
 
 
-def open_chain(path: str | os.PathLike[str]) -> Chain:
+def open_chain(path: PathLike) -> Chain:
     """Read a chain file.
 
     Parameters

@@ -20,10 +20,11 @@ C. J. Geyer (1992), Statistical Science 7, 473.
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import ndtri
 from scipy.stats import rankdata
+
+from bayesfred._typing import Floats
 
 __all__ = [
     "autocorrelation",
@@ -38,7 +39,7 @@ __all__ = [
 TAIL = 0.05
 
 
-def autocorrelation(series: NDArray[np.float64]) -> NDArray[np.float64]:
+def autocorrelation(series: Floats) -> Floats:
     """Autocorrelation at lags 0 to n_steps // 2, pooled over chains about their common mean.
 
     Parameters
@@ -65,7 +66,7 @@ def autocorrelation(series: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(covariance / covariance[0])
 
 
-def effective_size(series: NDArray[np.float64]) -> float:
+def effective_size(series: Floats) -> float:
     """Number of independent draws that fix the mean of `series` as well as its correlated ones.
 
     n_chains n_steps / tau with tau = 1 + 2 sum rho_t, summed over Geyer's initial monotone sequence
@@ -101,7 +102,7 @@ def effective_size(series: NDArray[np.float64]) -> float:
     return series.size / max(tau, 1.0)
 
 
-def rank_rhat(chains: NDArray[np.float64]) -> float:
+def rank_rhat(chains: Floats) -> float:
     """Rank-normalised split R-hat, the larger of that of the draws and of their distance from the median.
 
     Parameters
@@ -122,8 +123,8 @@ def rank_rhat(chains: NDArray[np.float64]) -> float:
 
 
 def convergence(
-    chain: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    chain: Floats,
+) -> tuple[Floats, Floats, Floats]:
     """R-hat between ensembles, and bulk and tail effective sample sizes, of every parameter.
 
     Walkers of one ensemble exchange positions, so R-hat compares ensembles: each is one chain of
@@ -149,7 +150,7 @@ def convergence(
     return rhats(chain), *effective_sizes(chain)
 
 
-def rhats(chain: NDArray[np.float64]) -> NDArray[np.float64]:
+def rhats(chain: Floats) -> Floats:
     """R-hat of every parameter, as in `convergence`."""
     n_ensembles, n_steps, n_walkers, d = chain.shape
     rhat = np.full(d, np.inf)
@@ -160,7 +161,7 @@ def rhats(chain: NDArray[np.float64]) -> NDArray[np.float64]:
     return rhat
 
 
-def effective_sizes(chain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def effective_sizes(chain: Floats) -> tuple[Floats, Floats]:
     """Bulk and tail effective sample sizes of every parameter, as in `convergence`.
 
     Each walker is a chain. That walkers of an ensemble lean on each other's positions is not in
@@ -177,7 +178,7 @@ def effective_sizes(chain: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
     return bulk_sizes(chain), tail
 
 
-def bulk_sizes(chain: NDArray[np.float64]) -> NDArray[np.float64]:
+def bulk_sizes(chain: Floats) -> Floats:
     """The first of `effective_sizes`."""
     bulk = np.zeros(chain.shape[3])
     for k, walkers in _walkers(chain):
@@ -185,7 +186,7 @@ def bulk_sizes(chain: NDArray[np.float64]) -> NDArray[np.float64]:
     return bulk
 
 
-def _walkers(chain: NDArray[np.float64]) -> Iterator[tuple[int, NDArray[np.float64]]]:
+def _walkers(chain: Floats) -> Iterator[tuple[int, Floats]]:
     """Every parameter whose draws are finite and enough, and its walkers as chains, shape (n_chains, n_steps)."""
     _, n_steps, n_walkers, d = chain.shape
     for k in range(d) if n_steps * n_walkers >= 4 else ():
@@ -196,13 +197,13 @@ def _walkers(chain: NDArray[np.float64]) -> Iterator[tuple[int, NDArray[np.float
             yield k, walkers
 
 
-def _normal_scores(draws: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normal_scores(draws: Floats) -> Floats:
     """Ranks of all draws together, mapped to normal quantiles with Blom's offset."""
     ranks = rankdata(draws, method="average").reshape(draws.shape)
     return np.asarray(ndtri((ranks - 0.375) / (draws.size + 0.25)))
 
 
-def _rhat(chains: NDArray[np.float64]) -> float:
+def _rhat(chains: Floats) -> float:
     """Gelman and Rubin's ratio of pooled to within-chain standard deviation."""
     n = chains.shape[1]
     within = float(np.mean(np.var(chains, axis=1, ddof=1)))

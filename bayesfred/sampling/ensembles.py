@@ -18,14 +18,12 @@ from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import MapEstimate
 from bayesfred.sampling.moves import LaplaceMove
-
-Floats = npt.NDArray[np.float64]
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
 # share of accepted moves below which proposals are made anew; half of them by differential
@@ -43,14 +41,12 @@ class Step(NamedTuple):
 
     coords: Floats  # (ensembles, walkers, d)
     log_prob: Floats  # (ensembles, walkers)
-    accepted: npt.NDArray[np.int64]  # (ensembles, walkers) moves accepted so far
+    accepted: Ints  # (ensembles, walkers) moves accepted so far
     random: list[tuple[Any, ...]]  # state of each ensemble's random numbers
     n_invalid: int  # log-probabilities so far that were NaN or +inf
 
     @classmethod
-    def of(
-        cls, states: list[emcee.State], accepted: npt.NDArray[np.int64], n_invalid: int
-    ) -> "Step":
+    def of(cls, states: list[emcee.State], accepted: Ints, n_invalid: int) -> "Step":
         """A copy of the ensembles' states."""
         coords, log_prob = (
             np.stack([s.coords for s in states]),

@@ -15,11 +15,10 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.special import gammaln, logsumexp, ndtr
 from scipy.stats import norm, truncnorm
 
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import MapEstimate, inverse
-
-Floats = npt.NDArray[np.float64]
 
 HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0

@@ -9,7 +9,6 @@ minute and at the end, so that a run that was stopped goes on where it was.
 """
 
 import math
-import os
 import platform
 import signal
 import threading
@@ -22,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.status import Status
 from threadpoolctl import threadpool_limits
 
+from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.lock import only_writer
 from bayesfred.model.posterior import Posterior
@@ -42,8 +41,6 @@ from bayesfred.sampling.chainfile import (
 from bayesfred.sampling.convergence import bulk_sizes, effective_sizes, rhats
 from bayesfred.sampling.ensembles import Step, adapted, advance, begin, check_start
 
-Floats = npt.NDArray[np.float64]
-
 RHAT = 1.01
 FIRST_CHECK = 8  # steps; fewer say nothing about autocorrelation
 GROWTH = 1.1  # of the number of steps between checks
@@ -57,7 +54,7 @@ def sample(
     posterior: Posterior,
     estimate: MapEstimate | None = None,
     *,
-    path: str | os.PathLike[str],
+    path: PathLike,
     seed: int,
     ensembles: int = 4,
     walkers: int = 32,

@@ -16,15 +16,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.polynomials import evaluate, multiply, shift
 from bayesfred.imaging.kernels.psf_profiles import Gaussian, Moffat, Spline
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 # rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
 LANES = 8

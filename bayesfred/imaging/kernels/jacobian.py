@@ -4,16 +4,13 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import footprints, locate, new_maps, new_work
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.psf_profiles import psf_bends, psf_slopes
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class Basis(NamedTuple):

@@ -9,13 +9,11 @@ from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 from numba.extending import overload
 
+from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.fastmath import LOG2_E, exp2, log
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-
-Floats = npt.NDArray[np.float64]
 
 
 class Gaussian(NamedTuple):

@@ -8,12 +8,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Ints
 from bayesfred.imaging.kernels.compilation import inner
 from bayesfred.imaging.kernels.fastmath import REDUCE
-
-Ints = npt.NDArray[np.int64]
 
 
 class Clusters(NamedTuple):

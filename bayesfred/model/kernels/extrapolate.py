@@ -18,8 +18,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import (
@@ -41,9 +41,6 @@ from bayesfred.model.kernels.likelihood import (
     next_run,
     room,
 )
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 BAND = 16  # rows visited at a time
 VISITS = 3  # of all pixels, after which the fluxes count as not known beforehand

@@ -22,8 +22,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, take_turn
 from bayesfred.imaging.kernels.geometry import (
@@ -60,9 +60,6 @@ from bayesfred.model.kernels.likelihood import (
     mark_sources,
     room,
 )
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class Patch(NamedTuple):

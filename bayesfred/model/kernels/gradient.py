@@ -27,8 +27,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.geometry import SEGMENT, new_work, row_starts
 from bayesfred.imaging.kernels.jacobian import Basis, add_basis_sums, basis_row
@@ -48,8 +48,6 @@ from bayesfred.model.kernels.likelihood import (
     log_likelihood,
     next_run,
 )
-
-Floats = npt.NDArray[np.float64]
 
 
 class Rows(NamedTuple):

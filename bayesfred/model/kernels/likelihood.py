@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, log
 from bayesfred.imaging.kernels.geometry import SEGMENT, footprints, locate, new_maps
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.uint8]
 
 MASKED = -1e300  # stands for the counts of a pixel outside the likelihood
