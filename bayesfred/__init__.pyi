@@ -12,7 +12,8 @@ from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
 from .model.noise import BackgroundNoise, PoissonNoise, simulate
 from .model.posterior import Nuisances, Posterior
-from .optimize.find_map import MapEstimate, find_map, reject_outliers
+from .optimize.estimate import MapEstimate
+from .optimize.find_map import find_map, reject_outliers
 from .sampling.chainfile import Chain, open_chain
 from .sampling.moves import LaplaceMove
 from .sampling.sampler import sample

@@ -27,7 +27,8 @@ from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError, printable
 from bayesfred.io import files
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate, reject_outliers
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import reject_outliers
 from bayesfred.reporting import html, plots
 from bayesfred.sampling.chainfile import Chain, open_chain
 from bayesfred.sampling.sampler import sample, searching, versions

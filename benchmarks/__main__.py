@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import bayesfred as bf
-from bayesfred.model import sampling
+from bayesfred.sampling import sampler
 
 THETA = np.array([0.0, 2e-6, 0.0, -2e-6, 1e-6, 2e-6, 0.0, 3e-6, 0.0, 1e-6, 1e-6, -1e-6])
 SAMPLES = 960_000  # kernel samples of the paper's frame at this tolerance
@@ -75,7 +75,7 @@ def dense_image(m: bf.ForwardModel) -> np.ndarray:
 
 def share(run: Callable[[], bf.Chain]) -> tuple[float, bf.Chain]:
     """Share of a run's time that saving it takes, and what it leaves."""
-    write, spent = sampling.write_chain, 0.0
+    write, spent = sampler.write_chain, 0.0
 
     def timed(*args: object) -> None:
         nonlocal spent
@@ -83,11 +83,11 @@ def share(run: Callable[[], bf.Chain]) -> tuple[float, bf.Chain]:
         write(*args)
         spent += time.perf_counter() - start
 
-    sampling.write_chain = timed
+    sampler.write_chain = timed
     start = time.perf_counter()
     chain = run()
     total = time.perf_counter() - start
-    sampling.write_chain = write
+    sampler.write_chain = write
     return spent / total, chain
 
 

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 import bayesfred as bf
-from bayesfred.model import estimate, sampling
+from bayesfred.optimize import find_map as search
+from bayesfred.sampling import sampler
 
 MEMORY = 4.0  # GiB
 
@@ -97,14 +98,14 @@ def main() -> int:
         posterior.fisher(posterior.start()),
     )  # compiled code is loaded
     split = Split()
-    split.watch(bf.Posterior, "unchecked_log_prob", "likelihoods")
+    split.watch(bf.Posterior, "log_prob", "likelihoods")
     split.watch(bf.Posterior, "gradient", "gradients")
     split.watch(bf.Posterior, "fisher", "Fisher information")
-    split.watch(estimate, "find_start", "peaks, matching")
-    split.watch(estimate, "goodness", "deviance at the maximum")
-    split.watch(sampling, "bulk_sizes", "checks for convergence")
-    split.watch(sampling, "effective_sizes", "checks for convergence")
-    split.watch(sampling, "write_chain", "checkpoints")
+    split.watch(search, "find_start", "peaks, matching")
+    split.watch(search, "goodness", "deviance at the maximum")
+    split.watch(sampler, "bulk_sizes", "checks for convergence")
+    split.watch(sampler, "effective_sizes", "checks for convergence")
+    split.watch(sampler, "write_chain", "checkpoints")
     top = split.run("rest of the search", bf.find_map, posterior)
     to_map = sum(split.spent.values())
     with tempfile.TemporaryDirectory() as folder:
@@ -134,7 +135,7 @@ def main() -> int:
         f"peak memory {memory:.1f} GiB of {MEMORY:.0f}, frame "
         f"{posterior.counts.nbytes / 2**30:.2f}; chain file {size:.0f} MiB"
     )
-    return 0 if top.converged and verdict.converged and memory <= MEMORY else 1
+    return 0 if top.fits_data and verdict.converged and memory <= MEMORY else 1
 
 
 if __name__ == "__main__":

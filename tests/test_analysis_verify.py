@@ -14,7 +14,8 @@ from test_sampling_chain import reseal, run
 from bayesfred.analysis.verify import Check, verify
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chainfile import Chain
 
 STEPS = 15

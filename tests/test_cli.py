@@ -1187,7 +1187,7 @@ def test_ctrl_c_in_a_likelihood_says_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ensembles take turns, a call a step; the 18th call, the first four being the walkers' places, is in the fourth step."""
-    log_prob = Posterior.unchecked_log_prob
+    log_prob = Posterior.log_prob
     calls = 0
 
     def stop(posterior: Posterior, params: NDArray[np.float64]) -> object:
@@ -1197,7 +1197,7 @@ def test_ctrl_c_in_a_likelihood_says_one_line(
             raise KeyboardInterrupt
         return log_prob(posterior, params)
 
-    monkeypatch.setattr(Posterior, "unchecked_log_prob", stop)
+    monkeypatch.setattr(Posterior, "log_prob", stop)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 130
     assert open_chain(folder / "run.h5").chain.shape[1] == 3
@@ -1208,7 +1208,7 @@ def test_ctrl_c_in_a_likelihood_says_one_line(
 def test_log_probabilities_that_are_no_numbers_are_counted(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log_prob = Posterior.unchecked_log_prob
+    log_prob = Posterior.log_prob
     calls = 0
 
     def spoilt(posterior: Posterior, params: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -1222,7 +1222,7 @@ def test_log_probabilities_that_are_no_numbers_are_counted(
             values[:2] = np.nan, np.inf
         return values
 
-    monkeypatch.setattr(Posterior, "unchecked_log_prob", spoilt)
+    monkeypatch.setattr(Posterior, "log_prob", spoilt)
     sections(sampling=FEW_STEPS)(folder)
     output = invoke(folder, "fit", "run.toml")
     assert output.code == 3

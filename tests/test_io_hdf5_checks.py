@@ -12,8 +12,9 @@ from test_model import make_model, make_posterior, make_truth
 from test_sampling_chain import reseal, run
 
 from bayesfred.errors import InputError
-from bayesfred.model import chainfile, examine
+from bayesfred.io import hdf5_checks
 from bayesfred.optimize.find_map import find_map
+from bayesfred.sampling import chainfile
 from bayesfred.sampling.chainfile import Chain, open_chain, random_states
 
 STEPS = 20
@@ -72,8 +73,10 @@ def test_a_file_is_little_larger_than_its_numbers(
 
 def test_the_seal_is_the_sha256_of_what_stands_before_it(whole: Chain) -> None:
     content = whole.path.read_bytes()
-    assert content[-examine.SEAL_SIZE :] == examine.seal(content[: -examine.SEAL_SIZE])
-    assert content.endswith(f"\nbayesfred sha256 {examine.stated_digest(whole.path)}\n".encode())
+    assert content[-hdf5_checks.SEAL_SIZE :] == hdf5_checks.seal(content[: -hdf5_checks.SEAL_SIZE])
+    assert content.endswith(
+        f"\nbayesfred sha256 {hdf5_checks.stated_digest(whole.path)}\n".encode()
+    )
 
 
 # --- flipped bits ---------------------------------------------------------------------------------
@@ -284,7 +287,7 @@ def deep_groups(file: h5py.File) -> None:
     "it"
 )
 def newer_schema(file: h5py.File) -> None:
-    file.attrs["schema"] = examine.SCHEMA + 1
+    file.attrs["schema"] = hdf5_checks.SCHEMA + 1
     file["ensemble_0/unheard_of"] = ["text"]
 
 
@@ -334,7 +337,7 @@ def test_a_good_file_passes_that_test_only_when_it_is_read(
         open_chain(path)
 
 
-@pytest.mark.parametrize("kept", [0, 1, 1000, -examine.SEAL_SIZE, -1])
+@pytest.mark.parametrize("kept", [0, 1, 1000, -hdf5_checks.SEAL_SIZE, -1])
 def test_cut_files_are_refused(path: Path, kept: int) -> None:
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(InputError, match=r"no seal|another content"):
@@ -350,7 +353,7 @@ def test_sealed_nonsense_is_refused(path: Path, content: bytes) -> None:
 
 
 def test_a_sealed_file_whose_inside_is_cut_is_refused(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: -20000 - examine.SEAL_SIZE])
+    path.write_bytes(path.read_bytes()[: -20000 - hdf5_checks.SEAL_SIZE])
     reseal(path)
     with pytest.raises(InputError, match=r"chain\.h5: damaged"):
         open_chain(path)

@@ -18,7 +18,8 @@ from bayesfred.model.extrapolation import FluxExtrapolation
 from bayesfred.model.kernels.extrapolate import ENOUGH
 from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.posterior import Nuisances, Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.sampler import sample
 
 Floats = NDArray[np.float64]

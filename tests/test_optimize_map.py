@@ -32,7 +32,8 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model import priors
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.model.posterior import Nuisances, Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.sampler import sample
 
 Floats = NDArray[np.float64]
@@ -187,7 +188,7 @@ def test_refits_scatter_as_the_covariance_says(nuisances: Nuisances, n: int) -> 
         posterior = Posterior(model, rng.poisson(mean), nuisances=nuisances, prior=FLAT)
         values = np.array([truth[name] for name in posterior.parameter_names])
         fits.append(find_map(posterior, values))
-    assert all(fit.converged for fit in fits)
+    assert all(fit.at_maximum and fit.fits_data for fit in fits)
     deviations = np.array([fit.params for fit in fits]) - values
     covariances = np.array([fit.covariance for fit in fits])
     assert abs(excess(deviations, covariances)) < 3.0
@@ -211,7 +212,11 @@ def test_map_is_found_from_afar_and_reports_itself() -> None:
     error = np.sqrt(np.diag(best.covariance))
     for factor in (-5.0, 5.0):
         again = find_map(posterior, truth + factor * error * rng.uniform(0, 1, truth.size))
-        assert again.converged and np.abs((again.params - best.params) / error).max() < 2e-3
+        assert (
+            again.at_maximum
+            and again.fits_data
+            and np.abs((again.params - best.params) / error).max() < 2e-3
+        )
     with h5py.File(io.BytesIO(), "w") as file:
         best.write(file)
         copy = MapEstimate.read(file)
@@ -281,7 +286,7 @@ def test_the_information_is_worked_out_once_a_place(monkeypatch: pytest.MonkeyPa
         return real(self, params)
 
     monkeypatch.setattr(Posterior, "fisher", fisher)
-    assert find_map(posterior, posterior.start()).converged
+    assert find_map(posterior, posterior.start()).fits_data
     assert len(places) == len(set(places)) > 1
 
 
@@ -295,7 +300,7 @@ def test_undetermined_parameters_are_named() -> None:
     # two terms that it can
     few = PolynomialDistortion([(1, 0, 2, 0)], [(0, 1, 2, 0)])
     model = ForwardModel(model.detector, model.sources, model.psf, few)
-    assert find_map(Posterior(model, posterior.counts)).converged
+    assert find_map(Posterior(model, posterior.counts)).fits_data
 
 
 def test_a_narrow_prior_determines_a_parameter() -> None:

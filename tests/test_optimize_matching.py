@@ -14,9 +14,10 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model import ascent, estimate, start
 from bayesfred.model.noise import BackgroundNoise, simulate
 from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.optimize import find_map as search
+from bayesfred.optimize import matching, newton
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.matching import Field, find_peaks, find_start, match, outward
 from bayesfred.optimize.newton import NewtonResult, maximize
@@ -140,7 +141,12 @@ def test_maximum_is_found_where_stars_move_by_one_and_a_half_spacings(nuisances:
     posterior = Posterior(model, simulate(model, truth, 2.0, seed=3), nuisances=nuisances)
     assert distance(posterior, np.append(truth, [2.0, 1.0])[: posterior.n_parameters]) < 0.01
     best = find_map(posterior)
-    assert best.converged and "matched peaks" in best.message and "81 of 81 sources" in best.message
+    assert (
+        best.at_maximum
+        and best.fits_data
+        and "matched peaks" in best.message
+        and "81 of 81 sources" in best.message
+    )
 
 
 def test_distortions_that_the_prior_holds_for_unlikely_are_found() -> None:
@@ -157,7 +163,7 @@ def test_an_unknown_pointing_is_found_on_a_grid() -> None:
     truth = lens(model, 20.0)
     counts = np.roll(simulate(model, truth, 2.0, seed=3), (-7, 12), axis=(0, 1))
     best = find_map(Posterior(model, counts, nuisances=Nuisances(offset=True)))
-    assert best.converged
+    assert best.at_maximum and best.fits_data
     assert (
         np.abs((best.params - [*truth, 2.0, 12.0, -7.0]) / np.sqrt(np.diag(best.covariance))).max()
         < 5.0
@@ -181,7 +187,7 @@ def test_blends_of_unequal_stars_with_some_missing_and_some_spurious() -> None:
     best = find_map(posterior)
     assert (
         best.at_maximum
-        and not best.converged
+        and not best.fits_data
         and "sources that the catalogue lacks or the frame misses" in best.message
     )
 
@@ -232,32 +238,32 @@ def test_no_start_folds(monkeypatch: pytest.MonkeyPatch) -> None:
         [2, 8]
     ] = -1e-3  # u^2 x and u^2 y: u - x - u^2 x / 1000 = 0 has no solution for the outer stars
     assert posterior.log_prob(np.append(folded, 2.0)) == -np.inf
-    monkeypatch.setattr(start, "match", lambda field, peaks: (folded, np.zeros((12, 12)), 25))
-    begun = start.find_start(posterior)
+    monkeypatch.setattr(matching, "match", lambda field, peaks: (folded, np.zeros((12, 12)), 25))
+    begun = matching.find_start(posterior)
     assert np.isfinite(posterior.log_prob(begun.params))
     # without the way back there would be nowhere to climb from
-    monkeypatch.setattr(start, "_unfolded", lambda posterior, params, plain: params)
-    assert start.find_start(posterior).path == "the prior's medians"
+    monkeypatch.setattr(matching, "_unfolded", lambda posterior, params, plain: params)
+    assert matching.find_start(posterior).path == "the prior's medians"
 
 
 def test_a_climb_that_ends_at_no_maximum_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     model = grid(side=5, distortion=MIRRORED)
     posterior = Posterior(model, simulate(model, np.zeros(12), 2.0, seed=7))
-    begun = start.find_start(posterior)
+    begun = matching.find_start(posterior)
     lost = NewtonResult(
         begun.params, float(posterior.log_prob(begun.params)), np.full((13, 13), np.nan), np.inf, 9
     )
     monkeypatch.setattr(
-        estimate,
+        search,
         "climb",
         lambda p, begin, **known: (
             lost if np.array_equal(begin, begun.params) else maximize(p, begin)
         ),
     )
     found = find_map(posterior)
-    assert found.converged and "the prior's medians" in found.message
+    assert found.at_maximum and found.fits_data and "the prior's medians" in found.message
     assert found.n_evaluations > lost.evaluations
-    monkeypatch.setattr(estimate, "other_starts", lambda posterior, tried: iter(()))
+    monkeypatch.setattr(search, "other_starts", lambda posterior, tried: iter(()))
     assert not find_map(posterior).at_maximum
 
 
@@ -408,13 +414,13 @@ def test_verdict() -> None:
     model = grid(side=5)
     counts = simulate(model, np.zeros(4), 2.0, seed=10)
     good = find_map(Posterior(model, counts))
-    assert good.converged and good.at_maximum and good.message.startswith("found")
+    assert good.fits_data and good.at_maximum and good.message.startswith("found")
     wrong = ForwardModel(model.detector, model.sources, GaussianPSF(2.5), CUBIC)
     bad = find_map(Posterior(wrong, counts))
-    assert bad.at_maximum and not bad.converged
+    assert bad.at_maximum and not bad.fits_data
     assert "exceed the noise" in bad.message and "PSF" in bad.message
     quiet = find_map(Posterior(model, model.expected_counts(np.zeros(4), 2.0)))
-    assert quiet.at_maximum and not quiet.converged and "check gain" in quiet.message
+    assert quiet.at_maximum and not quiet.fits_data and "check gain" in quiet.message
 
 
 def test_a_psf_wider_than_the_frame_leaves_no_peaks() -> None:
@@ -441,7 +447,7 @@ def test_consistent_frames_are_called_so() -> None:
     for seed, level in enumerate([0.05, 0.05, 0.05, 1.0, 1.0, 30.0, 30.0]):
         assert find_map(
             Posterior(model, simulate(model, lens(model, 5.0), level, seed=seed))
-        ).converged
+        ).fits_data
 
 
 def test_terms_that_differ_by_the_distortion_alone_are_not_refused() -> None:
@@ -449,7 +455,7 @@ def test_terms_that_differ_by_the_distortion_alone_are_not_refused() -> None:
     model = grid(distortion=PolynomialDistortion.full_polynomial(3))
     assert find_map(
         Posterior(model, simulate(model, np.zeros(model.distortion.n_terms), 2.0, seed=11))
-    ).converged
+    ).fits_data
 
 
 def test_a_search_that_ends_below_its_start_is_not_followed(
@@ -460,9 +466,9 @@ def test_a_search_that_ends_below_its_start_is_not_followed(
     begin = posterior.start()
     begin[0] += 5.0 / model.sources.x.max() ** 3
     # the search is called at once, and returns a point at which the map folds
-    monkeypatch.setattr(ascent, "AS_FORETOLD", 0.0)
+    monkeypatch.setattr(newton, "AS_PREDICTED", 0.0)
     monkeypatch.setattr(
-        ascent, "_search", lambda *_: optimize.OptimizeResult(x=np.full(5, 1e9), fun=1.0, nfev=1)
+        newton, "_search", lambda *_: optimize.OptimizeResult(x=np.full(5, 1e9), fun=1.0, nfev=1)
     )
     assert not np.isfinite(posterior.log_prob(begin + 1e9))
     reached = maximize(posterior, begin)

@@ -27,9 +27,10 @@ from test_sampling_chain import TOTAL, assert_same_file, draws_of, run
 
 from bayesfred.errors import InputError
 from bayesfred.io.lock import only_writer
-from bayesfred.model import chainfile, sampling
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
+from bayesfred.sampling import chainfile, sampler
 from bayesfred.sampling.chainfile import Chain, open_chain, random_states, write_chain
 
 HERE = Path(__file__).parent
@@ -200,14 +201,14 @@ def test_a_checkpoint_that_is_not_atomic_fails_that_test(
 
 def sample_without_end(path: Path, pipe: int) -> None:
     """Sample with a checkpoint after every step, and tell a pipe how many steps there are once they are saved."""
-    write = sampling.write_chain
+    write = sampler.write_chain
 
     def acknowledged(chain: Chain, *args: Any) -> None:
         write(chain, *args)
         os.write(pipe, f"{chain.chain.shape[1]}\n".encode())
 
-    sampling.CHECKPOINT, sampling.CHECKPOINT_SHARE = 0.0, np.inf
-    sampling.write_chain = acknowledged
+    sampler.CHECKPOINT, sampler.CHECKPOINT_SHARE = 0.0, np.inf
+    sampler.write_chain = acknowledged
     with contextlib.redirect_stdout(None):
         run(open_chain(path).posterior(), None, path, 10**6, resume=True)
 
@@ -285,7 +286,7 @@ def test_an_interrupt_while_saving_waits(
     protected: bool,
 ) -> None:
     """A Ctrl-C, and another while the steps are saved; without the protection the steps are lost."""
-    path, left, real = tmp_path / "chain.h5", 16, Posterior.unchecked_log_prob
+    path, left, real = tmp_path / "chain.h5", 16, Posterior.log_prob
 
     def stop(self: Posterior, params: Any) -> Any:
         nonlocal left
@@ -298,10 +299,10 @@ def test_an_interrupt_while_saving_waits(
         signal.raise_signal(signal.SIGINT)
         write_chain(*args)
 
-    monkeypatch.setattr(Posterior, "unchecked_log_prob", stop)
-    monkeypatch.setattr(sampling, "write_chain", impatient)
+    monkeypatch.setattr(Posterior, "log_prob", stop)
+    monkeypatch.setattr(sampler, "write_chain", impatient)
     if not protected:
-        monkeypatch.setattr(sampling, "_unbroken", contextlib.nullcontext)
+        monkeypatch.setattr(sampler, "_unbroken", contextlib.nullcontext)
     with pytest.raises(KeyboardInterrupt):
         run(posterior, estimate, path)
     assert path.exists() == protected
@@ -338,16 +339,16 @@ def test_checkpoints_keep_to_their_share(
         saved.append(now)
         now += 7.0
 
-    real = Posterior.unchecked_log_prob
+    real = Posterior.log_prob
 
     def step(self: Posterior, params: Any) -> Any:
         nonlocal now
         now += 5.0  # 2 ensembles, which seldom make more than a call each
         return real(self, params)
 
-    monkeypatch.setattr(sampling, "time", Clock)
-    monkeypatch.setattr(sampling, "write_chain", save)
-    monkeypatch.setattr(Posterior, "unchecked_log_prob", step)
+    monkeypatch.setattr(sampler, "time", Clock)
+    monkeypatch.setattr(sampler, "write_chain", save)
+    monkeypatch.setattr(Posterior, "log_prob", step)
     run(posterior, estimate, tmp_path / "chain.h5", 160)
     assert len(saved) == 4 and 30.0 <= saved[0] < 70.0
     assert np.all(np.diff(saved[:-1]) >= 700.0)
@@ -386,8 +387,8 @@ def test_a_full_disk_says_so_and_loses_nothing(
 ) -> None:
     path = small_disk / "chain.h5"
     with monkeypatch.context() as patch:
-        patch.setattr(sampling, "CHECKPOINT", 0.0)
-        patch.setattr(sampling, "CHECKPOINT_SHARE", np.inf)
+        patch.setattr(sampler, "CHECKPOINT", 0.0)
+        patch.setattr(sampler, "CHECKPOINT_SHARE", np.inf)
         with pytest.raises(
             InputError,
             match=r"cannot be written \(No space left on device\), expected a disk with room",
@@ -434,7 +435,7 @@ def without_rights() -> Iterator[None]:
 def test_a_read_only_folder_is_refused_before_the_work(
     posterior: Posterior, old: Chain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sampling, "find_map", lambda _: pytest.fail("the maximum was searched for"))
+    monkeypatch.setattr(sampler, "find_map", lambda _: pytest.fail("the maximum was searched for"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.copy(old.path, folder)
@@ -463,7 +464,7 @@ def test_a_read_only_folder_is_refused_before_the_work(
 def test_a_second_writer_hears_who_the_first_is_before_any_work(
     posterior: Posterior, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sampling, "find_map", lambda _: pytest.fail("the maximum was searched for"))
+    monkeypatch.setattr(sampler, "find_map", lambda _: pytest.fail("the maximum was searched for"))
     before = path.read_bytes()
     with only_writer(path):
         for options in ({"resume": True}, {"overwrite": True}, {}):
@@ -513,7 +514,7 @@ def test_a_file_that_appeared_meanwhile_is_not_replaced(
             shutil.copy(old.path, path)  # the other run has ended in the meantime
             yield
 
-    monkeypatch.setattr(sampling, "only_writer", waited)
+    monkeypatch.setattr(sampler, "only_writer", waited)
     with pytest.raises(InputError, match="exists, expected a new file"):
         run(posterior, None, tmp_path / "chain.h5", 2)
     assert (tmp_path / "chain.h5").read_bytes() == old.path.read_bytes()
@@ -548,8 +549,8 @@ def test_readers_and_attaches_disturb_nobody(
     attaches: int,
 ) -> None:
     """A checkpoint after every step, a reader every 10 ms, and others that attach, in 4 threads."""
-    monkeypatch.setattr(sampling, "CHECKPOINT", 0.0)
-    monkeypatch.setattr(sampling, "CHECKPOINT_SHARE", np.inf)
+    monkeypatch.setattr(sampler, "CHECKPOINT", 0.0)
+    monkeypatch.setattr(sampler, "CHECKPOINT_SHARE", np.inf)
     seen: list[int] = []
     errors: list[BaseException] = []
     waiting, attached = list(range(attaches)), list[int]()
@@ -572,17 +573,17 @@ def test_readers_and_attaches_disturb_nobody(
         while waiting and not stop.is_set():
             attached.append(attach(posterior, path, waiting.pop()))
 
-    real = Posterior.unchecked_log_prob
+    real = Posterior.log_prob
 
     def until_attached(self: Posterior, params: Any) -> Any:
         if errors or (len(attached) == attaches and len(seen) > 5):
             raise KeyboardInterrupt
         return real(self, params)
 
-    monkeypatch.setattr(Posterior, "unchecked_log_prob", until_attached)
+    monkeypatch.setattr(Posterior, "log_prob", until_attached)
     threads = [threading.Thread(target=guarded(work)) for work in (poll, *4 * [attach_often])]
     started = threading.Event()
-    write = sampling.write_chain
+    write = sampler.write_chain
 
     def begin(*args: Any) -> None:
         write(*args)
@@ -591,7 +592,7 @@ def test_readers_and_attaches_disturb_nobody(
             for thread in threads:
                 thread.start()
 
-    monkeypatch.setattr(sampling, "write_chain", begin)
+    monkeypatch.setattr(sampler, "write_chain", begin)
     try:
         with pytest.raises(KeyboardInterrupt):
             run(posterior, None, path, 10**5, resume=True)

@@ -31,7 +31,8 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import simulate
 from bayesfred.model.posterior import Nuisances, Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.ensembles import Step, advance, begin
 from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
 from bayesfred.sampling.sampler import sample
@@ -144,13 +145,12 @@ def stand_ins(target: Target) -> tuple[Any, MapEstimate]:
     """Posterior and estimate, as far as the ensembles ask for them."""
     d = len(target.first)
     posterior = SimpleNamespace(
-        unchecked_log_prob=target.log_prob,
         log_prob=target.log_prob,
-        n_parameters=d,
-        nuisances=Nuisances(),
+        parameter_names=tuple(f"x{k}" for k in range(d)),
+        hyperparameters=(),
         support=(np.full(d, -np.inf), np.full(d, np.inf)),
     )
-    return posterior, MapEstimate(target.mean, target.covariance, 0.0, True, 0, "")
+    return posterior, MapEstimate(target.mean, target.covariance, 0.0, 0, "")
 
 
 def default_mix(target: Target, seed: int) -> Steps:
@@ -286,7 +286,7 @@ def test_a_conjugate_posterior_is_sampled(tmp_path: Path, precision: float, wron
         mode,
         covariance,
     )
-    estimate = MapEstimate(mode, covariance, posterior.log_prob(mode), True, 0, "")
+    estimate = MapEstimate(mode, covariance, posterior.log_prob(mode), 0, "")
     steps, walkers = round(0.6 / precision**2), WALKERS // ENSEMBLES
     chain = sample(
         posterior,

@@ -30,7 +30,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise
 from bayesfred.model.posterior import Nuisances, Posterior
-from bayesfred.optimize.find_map import inverse
+from bayesfred.optimize.estimate import inverse
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chainfile import fingerprint
 

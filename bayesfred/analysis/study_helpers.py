@@ -8,7 +8,8 @@ import numpy as np
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.ensembles import advance, begin, check_start
 from bayesfred.sampling.sampler import burn_in

@@ -375,19 +375,15 @@ class Posterior:
         Returns
         -------
         float or ndarray, shape (n,)
-            -inf outside the prior's support, and where the arithmetic gives NaN or +inf.
+            -inf outside the prior's support; NaN and +inf, where the arithmetic gives them, are no
+            densities.
 
         Raises
         ------
         InputError
             If a parameter vector has another length.
         """
-        values = self.unchecked_log_prob(self._vectors(params))
-        values[~(values < np.inf)] = -np.inf
-        return float(values[0]) if np.ndim(params) == 1 else values
-
-    def unchecked_log_prob(self, vectors: Floats) -> Floats:
-        """`log_prob` of vectors of shape (n, d) as the arithmetic gives it, with its NaN and +inf."""
+        vectors = self._vectors(params)
         prior = self.log_prior(vectors)
         out = np.where(np.isnan(prior), -np.inf, prior)
         arguments = self._arguments(vectors)
@@ -417,7 +413,7 @@ class Posterior:
             helper.result()
         out += np.where(np.isfinite(out), prior + self._constant, 0.0)
         out[np.isnan(prior)] = np.nan
-        return out
+        return float(out[0]) if np.ndim(params) == 1 else out
 
     def near(self, params: Floats, covariance: Floats) -> "Posterior":
         """The same posterior, with a `log_prob` that is several times faster around `params` where fluxes are free.
@@ -480,6 +476,11 @@ class Posterior:
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d)."""
         return self._log_prior(self._vectors(params))
+
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """Scale parameters, on which proposals nest the Laplace approximation."""
+        return ("position_scatter",) if self.nuisances.position_scatter else ()
 
     @cached_property
     def support(self) -> tuple[Floats, Floats]:

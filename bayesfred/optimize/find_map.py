@@ -1,18 +1,16 @@
-"""The posterior's maximum and its Laplace approximation: `start.py` says where to begin, `ascent.py` climbs, here it is judged."""
+"""The posterior's maximum: `matching` says where to begin, `newton` maximises, here it is judged."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model import priors
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.fit_statistics import fit_statistics
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
 from bayesfred.optimize.matching import Start, find_start, other_starts
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import Clipped, settle, whole
@@ -24,68 +22,9 @@ LEAST_INFORMATION = 0.01
 # ... nor is it missed if it makes up less than this share of what its priors allow.
 LEAST_EFFECT = 0.01
 
-# Residuals are those of the noise where the deviance is within so many standard deviations of its
-# expectation.
-CONSISTENT = 5.0
-
 # The maximum is found where a Newton step from it would move no parameter by more than this share
 # of its error.
 CLOSENESS = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class MapEstimate:
-    """The posterior's maximum.
-
-    Attributes
-    ----------
-    params : ndarray, shape (d,)
-        Most probable parameters, in the order of `Posterior.parameter_names`.
-    covariance : ndarray, shape (d, d)
-        Inverse of Fisher information plus prior curvature there: the Laplace approximation.
-    log_prob : float
-        Log-posterior density there.
-    converged : bool
-        Whether this is a maximum and the deviance there is what the noise makes it, within 5
-        standard deviations.
-    n_evaluations : int
-        Log-posteriors evaluated.
-    message : str
-        How the search ended and where it began; what to do where it has not converged.
-    at_maximum : bool
-        Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits;
-        of parameters at a bound of their prior it may point out of the support.
-    """
-
-    params: Floats
-    covariance: Floats
-    log_prob: float
-    converged: bool
-    n_evaluations: int
-    message: str
-    at_maximum: bool = True
-
-    def write(self, group: Any) -> None:
-        """Store the estimate in an HDF5 group."""
-        group.create_dataset("params", data=self.params)
-        group.create_dataset("covariance", data=self.covariance)
-        group.attrs["message"] = np.bytes_(self.message.encode())
-        for name in ("log_prob", "converged", "n_evaluations", "at_maximum"):
-            group.attrs[name] = getattr(self, name)
-
-    @classmethod
-    def read(cls, group: Any) -> "MapEstimate":
-        """The estimate stored in an HDF5 group by `write`."""
-        a = group.attrs
-        return cls(
-            group["params"][()],
-            group["covariance"][()],
-            float(a["log_prob"]),
-            bool(a["converged"]),
-            int(a["n_evaluations"]),
-            bytes(a["message"]).decode(),
-            bool(a["at_maximum"]),
-        )
 
 
 def undetermined(posterior: Posterior, params: Floats, fisher: Floats) -> tuple[str, ...]:
@@ -164,7 +103,7 @@ def find_map(posterior: Posterior, start: Sequence[float] | Floats | None = None
     ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
     ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
     >>> posterior = bf.Posterior(model, bf.simulate(model, [1e-4], 2.0, seed=1))
-    >>> find_map(posterior).converged
+    >>> find_map(posterior).fits_data
     True
     """
     return _search(whole, posterior, start)[1]
@@ -213,10 +152,10 @@ def reject_outliers(
     >>> counts = bf.simulate(model, [1e-4], 2.0, seed=1)
     >>> counts[40:43, 20:23] += 500.0  # in no catalogue
     >>> posterior = bf.Posterior(model, counts)
-    >>> find_map(posterior).converged
+    >>> find_map(posterior).fits_data
     False
     >>> clipped, estimate = reject_outliers(posterior)
-    >>> estimate.converged, bool(clipped.mask[41, 21]), len(clipped.model.sources)
+    >>> estimate.fits_data, bool(clipped.mask[41, 21]), len(clipped.model.sources)
     (True, False, 9)
     """
     return _search(settle, posterior, start)
@@ -276,7 +215,7 @@ def _judged(
 ) -> MapEstimate:
     """Whether it is a maximum of what is left of the posterior that was given, and whether the model fits there."""
     at_maximum = top.distance < CLOSENESS
-    excess = _excess(posterior, top.params)
+    excess = misfit(fit_statistics(posterior, top.params))
     message = (
         f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} "
         f"evaluations{how}"
@@ -297,9 +236,9 @@ def _judged(
         message = f"found, {message}; {_advice(excess, clipped=posterior is not given)}"
     else:
         message = f"found, {message}; residuals as the noise makes them"
-    converged = at_maximum and abs(excess) <= CONSISTENT
+    fits = abs(excess) <= CONSISTENT
     return MapEstimate(
-        top.params, top.covariance, top.log_prob, converged, evaluations, message, at_maximum
+        top.params, top.covariance, top.log_prob, evaluations, message, at_maximum, fits
     )
 
 
@@ -309,12 +248,6 @@ def _how(posterior: Posterior, begun: Start) -> str:
         if begun.path
         else ""
     )
-
-
-def _excess(posterior: Posterior, params: Floats) -> float:
-    """By how many standard deviations the deviance differs from what noise alone makes of it."""
-    fit = fit_statistics(posterior, params)
-    return float((fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"])
 
 
 def _advice(excess: float, *, clipped: bool) -> str:
@@ -336,10 +269,3 @@ def _advice(excess: float, *, clipped: bool) -> str:
         "below its expectation): check "
         "gain and read noise"
     )
-
-
-def inverse(matrix: Floats) -> Floats:
-    """Inverse of a symmetric positive definite matrix whose rows differ in scale."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    inverse = linalg.inv(matrix * np.outer(scale, scale))
-    return np.asarray(0.5 * (inverse + inverse.T) * np.outer(scale, scale))

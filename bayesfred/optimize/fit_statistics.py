@@ -27,6 +27,7 @@ fit.
 """
 
 import math
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -42,6 +43,9 @@ from bayesfred.model.posterior import Posterior
 SERIES_FROM = 1e3
 SMALL_UNTIL = 1e-6
 BLOCK = 2**16  # pixels
+
+# The model fits where the deviance is within this many standard deviations of its expectation.
+CONSISTENT = 5.0
 
 
 def deviance_moments(
@@ -152,3 +156,8 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
         "deviance_expected": mean - fit["n_fitted"],
         "deviance_sd": float(np.sqrt(left)),
     }
+
+
+def misfit(fit: Mapping[str, float]) -> float:
+    """By how many standard deviations the deviance of `fit_statistics` exceeds its expectation."""
+    return float((fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"])

@@ -27,7 +27,7 @@ from bayesfred._typing import Floats, Ints, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate
+from bayesfred.optimize.estimate import MapEstimate
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")

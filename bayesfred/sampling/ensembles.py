@@ -21,8 +21,8 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
-from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate
+from bayesfred.model.protocol import TargetDensity
+from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
@@ -66,18 +66,18 @@ class Step(NamedTuple):
 class _LogProb:
     """The log-posterior as emcee gets it: NaN and +inf, which are no densities, become -inf and are counted."""
 
-    def __init__(self, posterior: Posterior, n_invalid: int) -> None:
+    def __init__(self, posterior: TargetDensity, n_invalid: int) -> None:
         self.posterior, self.n_invalid = posterior, n_invalid
 
     def __call__(self, params: Floats) -> Floats:
-        values = self.posterior.unchecked_log_prob(params)
+        values = self.posterior.log_prob(params)
         invalid = ~(values < np.inf)
         self.n_invalid += int(invalid.sum())
         return np.where(invalid, -np.inf, values)
 
 
 def begin(
-    posterior: Posterior, estimate: MapEstimate, seed: int, ensembles: int, walkers: int
+    posterior: TargetDensity, estimate: MapEstimate, seed: int, ensembles: int, walkers: int
 ) -> Step:
     """Walkers at draws of the Laplace approximation that the prior admits.
 
@@ -86,17 +86,17 @@ def begin(
     InputError
         If the estimate is not one of this posterior, or there is no density around it.
     """
-    if np.shape(estimate.params) != (posterior.n_parameters,):
+    if np.shape(estimate.params) != (len(posterior.parameter_names),):
         raise InputError(
             f"estimate: got {np.size(estimate.params)} parameters, expected "
-            f"{posterior.n_parameters}: find this posterior's maximum"
+            f"{len(posterior.parameter_names)}: find this posterior's maximum"
         )
     move = LaplaceMove.of(posterior, estimate)
     log_prob_of = _LogProb(posterior, 0)
     states = []
     for child in np.random.SeedSequence(seed).spawn(ensembles):
         random = np.random.RandomState(np.random.MT19937(child))
-        coords, log_prob = np.empty((0, posterior.n_parameters)), np.empty(0)
+        coords, log_prob = np.empty((0, len(posterior.parameter_names))), np.empty(0)
         for _ in range(100):
             drawn = move.draw(walkers, random)
             values = log_prob_of(drawn)
@@ -184,7 +184,7 @@ def adapted(chain: Floats) -> int:
 
 
 def _moves(
-    posterior: Posterior, estimate: MapEstimate, chain: Floats
+    posterior: TargetDensity, estimate: MapEstimate, chain: Floats
 ) -> list[tuple[emcee.moves.Move, float]]:
     """The moves that make the step after those in the chain, each with its share.
 
@@ -203,7 +203,7 @@ def _moves(
 
 
 def advance(
-    posterior: Posterior, estimate: MapEstimate, start: Step, steps: Sequence[Step] = ()
+    posterior: TargetDensity, estimate: MapEstimate, start: Step, steps: Sequence[Step] = ()
 ) -> Iterator[Step]:
     """Step all ensembles in turn, without end; a step is one when every ensemble has made it.
 

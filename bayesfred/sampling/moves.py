@@ -17,8 +17,8 @@ from scipy.stats import norm, truncnorm
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate, inverse
+from bayesfred.model.protocol import TargetDensity
+from bayesfred.optimize.estimate import MapEstimate, inverse
 
 HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
@@ -111,7 +111,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         self.weights = np.asarray(weights, dtype=np.float64)
 
     @classmethod
-    def of(cls, posterior: Posterior, estimate: MapEstimate) -> "LaplaceMove":
+    def of(cls, posterior: TargetDensity, estimate: MapEstimate) -> "LaplaceMove":
         """The move for a posterior, given its maximum.
 
         The scatter tau of the sources' positions sets the errors of all that is measured from
@@ -126,14 +126,14 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         ----------
         H. Rue, S. Martino & N. Chopin (2009), JRSS B 71, 319, Section 3.
         """
-        if not posterior.nuisances.position_scatter:
+        if not posterior.hyperparameters:
             mean = estimate.params
             if np.any(
                 (mean <= posterior.support[0]) | (mean >= posterior.support[1])
             ):  # the paraboloid's top is outside
                 mean = mean + estimate.covariance @ posterior.gradient(mean)
             return cls(mean, estimate.covariance, support=posterior.support)
-        j = posterior.parameter_names.index("position_scatter")
+        j = posterior.parameter_names.index(posterior.hyperparameters[0])
         rest = np.arange(estimate.params.size) != j
         ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
         means, covariances = [], []

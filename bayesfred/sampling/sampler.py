@@ -30,7 +30,8 @@ from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.lock import only_writer
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import MapEstimate, find_map
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chainfile import (
     Chain,
     check_same_posterior,

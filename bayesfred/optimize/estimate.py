@@ -1,0 +1,70 @@
+"""The maximum of a posterior with its Laplace approximation, as a record."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+
+from bayesfred._typing import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class MapEstimate:
+    """The posterior's maximum.
+
+    Attributes
+    ----------
+    params : ndarray, shape (d,)
+        Most probable parameters, in the order of `Posterior.parameter_names`.
+    covariance : ndarray, shape (d, d)
+        Inverse of Fisher information plus prior curvature there: the Laplace approximation.
+    log_prob : float
+        Log-posterior density there.
+    n_evaluations : int
+        Log-posteriors evaluated.
+    message : str
+        How the search ended and where it began; what to do where it was not found, or the model does not fit.
+    at_maximum : bool
+        Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits;
+        of parameters at a bound of their prior it may point out of the support.
+    fits_data : bool
+        Whether the deviance there is what the noise makes it, within 5 standard deviations.
+    """
+
+    params: Floats
+    covariance: Floats
+    log_prob: float
+    n_evaluations: int
+    message: str
+    at_maximum: bool = True
+    fits_data: bool = True
+
+    def write(self, group: Any) -> None:
+        """Store the estimate in an HDF5 group."""
+        group.create_dataset("params", data=self.params)
+        group.create_dataset("covariance", data=self.covariance)
+        group.attrs["message"] = np.bytes_(self.message.encode())
+        for name in ("log_prob", "n_evaluations", "at_maximum", "fits_data"):
+            group.attrs[name] = getattr(self, name)
+
+    @classmethod
+    def read(cls, group: Any) -> "MapEstimate":
+        """The estimate stored in an HDF5 group by `write`."""
+        a = group.attrs
+        return cls(
+            group["params"][()],
+            group["covariance"][()],
+            float(a["log_prob"]),
+            int(a["n_evaluations"]),
+            bytes(a["message"]).decode(),
+            bool(a["at_maximum"]),
+            bool(a["fits_data"]),
+        )
+
+
+def inverse(matrix: Floats) -> Floats:
+    """Inverse of a symmetric positive definite matrix whose rows differ in scale."""
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    inverse = linalg.inv(matrix * np.outer(scale, scale))
+    return np.asarray(0.5 * (inverse + inverse.T) * np.outer(scale, scale))
