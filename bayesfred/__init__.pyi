@@ -11,7 +11,8 @@ from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
 from .model.noise import BackgroundNoise, PoissonNoise, simulate
-from .model.posterior import Nuisances, Posterior
+from .model.parameters import Nuisances
+from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
 from .sampling.chainfile import Chain, open_chain

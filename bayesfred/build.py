@@ -16,7 +16,8 @@ from bayesfred.imaging.psf import PSF, GaussianPSF, MoffatPSF, SampledPSF
 from bayesfred.io import files
 from bayesfred.model import priors
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
 # deviations of a term's default prior. Sources whose light is farther from the frame than that are

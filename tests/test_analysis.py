@@ -13,7 +13,7 @@ from scipy.stats import norm, poisson
 
 from bayesfred.analysis.diagnostics import autocorrelation_time, diagnose
 from bayesfred.model.noise import BackgroundNoise
-from bayesfred.model.posterior import Nuisances
+from bayesfred.model.parameters import Nuisances
 from bayesfred.optimize.fit_statistics import deviance_moments
 from bayesfred.sampling.convergence import convergence, effective_size, rank_rhat
 

@@ -21,7 +21,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model.posterior import Nuisances
+from bayesfred.model.parameters import Nuisances
 from bayesfred.reporting import plots
 from bayesfred.reporting.html import write_report
 

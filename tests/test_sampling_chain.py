@@ -24,7 +24,8 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.io import hdf5_checks
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling import ensembles, sampler

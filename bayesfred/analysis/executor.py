@@ -38,7 +38,7 @@ from bayesfred._typing import PathLike
 from bayesfred.errors import InputError, printable
 from bayesfred.io import files
 from bayesfred.io.lock import only_writer
-from bayesfred.model.posterior import one_thread
+from bayesfred.model.threads import one_thread
 from bayesfred.sampling.sampler import versions
 
 WAITING = 4  # tasks sent ahead for each worker that is known
