@@ -13,7 +13,9 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF, GaussianPSF, MoffatPSF, SampledPSF
-from bayesfred.io import files
+from bayesfred.io.catalogues import read_catalogue
+from bayesfred.io.frames import read_frame, require_memory
+from bayesfred.io.paths import resolve
 from bayesfred.model import priors
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.model.posterior import Nuisances, Posterior
@@ -33,8 +35,8 @@ def catalogue(
     and the frame; and outside if no light reaches the frame from an image that stands `STRAY`
     nearer. If all are outside, all are kept: the posterior says so.
     """
-    c, path = run.catalogue, settings.resolve(run.catalogue.path, run_file, must_exist=True)
-    record = files.read_catalogue(
+    c, path = run.catalogue, resolve(run.catalogue.path, run_file, must_exist=True)
+    record = read_catalogue(
         path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point
     )
     half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
@@ -58,8 +60,8 @@ def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
         return GaussianPSF(p.sigma)
     if p.fwhm is not None and p.beta is not None:
         return MoffatPSF(p.fwhm, p.beta)
-    path = settings.resolve(p.path or "", run_file, must_exist=True)
-    image = files.read_frame(path, gain=1.0)
+    path = resolve(p.path or "", run_file, must_exist=True)
+    image = read_frame(path, gain=1.0)
     if image.n_masked:
         raise InputError(
             f"{path}: got {image.n_masked} pixels that are not finite, expected samples of a PSF: "
@@ -126,7 +128,7 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
     """A simulated frame's posterior and the true parameters."""
     s = run.simulation
     assert s is not None, "checked by the callers"
-    files.require_memory(f"{run_file}: simulation.shape", s.shape)
+    require_memory(f"{run_file}: simulation.shape", s.shape)
     psf = reference_psf(run, run_file)
     if s.grid:
         sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)

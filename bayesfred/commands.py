@@ -25,7 +25,11 @@ from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy, noise_study
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError, printable
-from bayesfred.io import files
+from bayesfred.io.atomic import replace
+from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
+from bayesfred.io.frames import read_frame, write_frame
+from bayesfred.io.paths import resolve, within
+from bayesfred.io.tables import TableRecord, write_table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import reject_outliers
@@ -127,19 +131,19 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
     posterior, _ = build.simulated(run, Path(run_file), run.simulation.seed)
     # written beside the run file, whatever lies in the data folder
     folder = Path(run_file).parent
-    frame = settings.within(folder, run.frame.path, f"{run_file}: frame.path")
-    catalogue = settings.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
+    frame = within(folder, run.frame.path, f"{run_file}: frame.path")
+    catalogue = within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
     if os.path.lexists(frame) and not overwrite:  # before the catalogue is written
         raise InputError(
             f"{frame}: exists, expected a new file: rename it, or replace it with --overwrite"
         )
     if run.simulation.grid is not None:
         s = posterior.model.sources
-        files.write_catalogue(
-            catalogue, files.CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite
+        write_catalogue(
+            catalogue, CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite
         )
         print(f"{printable(str(catalogue))}: {len(s)} sources")
-    files.write_frame(frame, posterior.counts, overwrite=overwrite)
+    write_frame(frame, posterior.counts, overwrite=overwrite)
     ny, nx = posterior.counts.shape
     print(f"{printable(str(frame))}: {ny} x {nx} pixels, {posterior.counts.sum():.0f} counts")
 
@@ -168,7 +172,7 @@ def fit(run_file: PathLike, *, resume: bool = False, overwrite: bool = False) ->
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
     output = _output(run, run_file)
-    path = settings.resolve(run.frame.path, run_file, must_exist=True)
+    path = resolve(run.frame.path, run_file, must_exist=True)
     if os.path.exists(output) and output.samefile(path):
         raise InputError(
             f"{run_file}: output.path: got the frame's file, expected another: the chain would "
@@ -195,8 +199,8 @@ def _framed(
 ) -> tuple[Posterior, MapEstimate | None, list[str]]:
     """The posterior of the frame that a run file names, its maximum where clipping has found it, and what there is to say."""
     f = run.frame
-    path = settings.resolve(f.path, run_file, must_exist=True)
-    frame = files.read_frame(
+    path = resolve(f.path, run_file, must_exist=True)
+    frame = read_frame(
         path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
     print(frame.description)
@@ -260,7 +264,7 @@ def study(
     run = settings.read_settings(run_file)
     s, simulation = run.study or settings.StudySettings(), run.simulation
     kind = kind or s.kind
-    table = settings.within(
+    table = within(
         ".", s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv"), f"{run_file}: study.path"
     )
     summary, picture = table.with_name(f"{table.stem}.summary.ecsv"), table.with_suffix(".png")
@@ -304,9 +308,9 @@ def study(
         else:
             result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)
     found = result.cells if isinstance(result, NoiseStudy) else result.quantities
-    files.write_table(
+    write_table(
         summary,
-        files.TableRecord(found, {"study": kind, "message": result.message}),
+        TableRecord(found, {"study": kind, "message": result.message}),
         overwrite=True,
     )
     figure = (
@@ -314,7 +318,7 @@ def study(
         if isinstance(result, NoiseStudy)
         else plots.calibration_plot(result)
     )
-    files.write_bytes(picture, plots.png(figure), overwrite=True)
+    replace(picture, plots.png(figure))
     Console(width=None if sys.stdout.isatty() else 120).print(_studied(result))
     print(result.message)
     for label, path in (("table", table), ("summary", summary), ("picture", picture)):
@@ -479,7 +483,7 @@ def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
 
 def _output(run: settings.RunSettings, run_file: Path) -> Path:
     """Where the chain goes: inside the folder that the run is started in, whatever a run file from elsewhere says."""
-    return settings.within(
+    return within(
         ".", run.output.path or Path("chains", f"{run_file.stem}.h5"), f"{run_file}: output.path"
     )
 
@@ -601,7 +605,7 @@ def _report(
         chain.parameter_names,
         truth=truth,
     )
-    files.write_bytes(picture, plots.png(figure), overwrite=True)
+    replace(picture, plots.png(figure))
     print(diagnostics.message)
     for label, path in (("chain", chain.path), ("report", page), ("picture", picture)):
         print(f"{label:8}{printable(str(path))}")

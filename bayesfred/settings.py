@@ -10,10 +10,8 @@ this module is a complete run file. Frames and catalogues are read in `bayesfred
 from __future__ import annotations
 
 import difflib
-import errno
 import inspect
 import json
-import os
 import re
 import reprlib
 import tomllib
@@ -496,98 +494,6 @@ def read_settings(path: str | Path) -> RunSettings:
         raise InputError(
             f"{path}: not TOML ({reason}), expected sections of key = value"
         ) from error
-
-
-def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False) -> Path:
-    """Find a file that a run file names.
-
-    Parameters
-    ----------
-    path : str or Path
-        As the run file gives it. An absolute path stays; a relative one is looked up beside the run
-        file, then in the folder that the environment variable BAYESFRED_DATA names.
-    run_file : str or Path
-        The run file.
-    must_exist : bool
-        Raise where nothing is found, and say where it was sought.
-
-    Returns
-    -------
-    Path
-        The file found, or else the place beside the run file.
-
-    Raises
-    ------
-    InputError
-        With `must_exist`, where there is no such file.
-
-    Examples
-    --------
-    >>> resolve("frame.fits", "no_such_folder/run.toml").as_posix()
-    'no_such_folder/frame.fits'
-    """
-    folder = os.environ.get("BAYESFRED_DATA")
-    places = [Path(run_file).parent / path]
-    if folder and not Path(path).is_absolute():
-        places.append(Path(folder) / path)
-    found = next(
-        (place for place in places if os.path.exists(place)), None
-    )  # unlike Path.exists, whatever the path
-    if found is None and must_exist:
-        remedy = "check the path"
-        if not Path(path).is_absolute():
-            remedy += " or set BAYESFRED_DATA to the folder that holds it"
-        tried = " or ".join(map(str, places))
-        raise InputError(f"{run_file}: got {str(path)!r}, expected a file at {tried}; {remedy}")
-    return found or places[0]
-
-
-def within(folder: str | Path, path: str | Path, where: str) -> Path:
-    """Find the place of a file to write, which a run file names but must not choose outside a folder.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The folder.
-    path : str or Path
-        As the run file gives it, relative to the folder.
-    where : str
-        Run file and key, to begin the line with.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    InputError
-        The path leads out of the folder, by being absolute, by .. or through links, or it is no
-        path.
-
-    Examples
-    --------
-    >>> within("commands", "night/one.h5", "run.toml: output.path").as_posix()
-    'runs/night/one.h5'
-    >>> within("commands", "../one.h5", "run.toml: output.path")
-    Traceback (most recent call last):
-    ...
-    bayesfred.errors.InputError: run.toml: output.path: got '../one.h5', which leads out of ..., expected a path that stays inside
-    """
-    place = Path(folder) / path
-    inside = False
-    try:
-        inside = place.resolve().is_relative_to(Path(folder).resolve())
-        os.stat(place)
-    # from Python 3.13 on `resolve` does not mind a loop of links; other faults show when it is
-    # opened
-    except OSError as error:
-        inside = inside and error.errno != errno.ELOOP
-    except (RuntimeError, ValueError):  # a loop of links, a zero byte
-        pass
-    if not inside:
-        leads = f"{str(path)!r}, which leads out of {Path(folder).absolute()}"
-        raise InputError(f"{where}: got {leads}, expected a path that stays inside")
-    return place
 
 
 def _mistake(details: Any) -> str:

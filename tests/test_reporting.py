@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -207,7 +208,7 @@ def test_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.Mo
         raise OSError("disk full")
 
     monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match=r"report\.html: cannot be written \(disk full\)"):
         report(tmp_path, title="Another")
     assert (tmp_path / "report.html").read_text() == "old page"
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

@@ -12,7 +12,8 @@ from pydantic import BaseModel, ValidationError
 
 from bayesfred import settings
 from bayesfred.errors import InputError
-from bayesfred.settings import PriorSettings, RunSettings, read_settings, resolve, within
+from bayesfred.io.paths import resolve, within
+from bayesfred.settings import PriorSettings, RunSettings, read_settings
 
 EXAMPLE = Path(settings.__file__).with_name("example.toml").read_text(encoding="utf-8")
 

@@ -7,7 +7,6 @@ opened years later. Text that comes from a user is escaped by the template engin
 
 import base64
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -21,6 +20,7 @@ from matplotlib.figure import Figure
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.errors import printable
+from bayesfred.io.atomic import replace
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting import plots
 from bayesfred.sampling.chainfile import Chain
@@ -94,6 +94,11 @@ def write_report(
     -------
     Path
         The page.
+
+    Raises
+    ------
+    InputError
+        The page cannot be written.
     """
     path = Path(path)
     draws = chain.draws()
@@ -116,7 +121,7 @@ def write_report(
         notes=notes,
         settings=settings,
     )
-    _replace(path, page)
+    replace(path, page.encode())
     return path
 
 
@@ -259,19 +264,6 @@ def _data_uri(figure: Figure) -> str:
     buffer = BytesIO()
     figure.savefig(buffer, format="png", facecolor="white")
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def _replace(path: Path, page: str) -> None:
-    """Write beside the target and rename, so that no reader meets half a page."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with part.open("w", encoding="utf-8") as stream:
-            stream.write(page)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _scale(value: float, sd: float) -> tuple[int, int]:

@@ -10,10 +10,8 @@ read.
 import hashlib
 import io
 import math
-import os
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ import xarray as xr
 
 from bayesfred._typing import Floats, Ints, PathLike
 from bayesfred.errors import InputError
+from bayesfred.io.atomic import replace
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -176,7 +175,12 @@ def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, 
         for k, state in enumerate(states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
     with content.getbuffer() as written:
-        _replace(chain.path, written)
+        try:
+            replace(chain.path, written, seal(written), sole_writer=True)
+        except InputError as error:
+            raise InputError(
+                f"{error}: what was saved before is still there: resume from it"
+            ) from None
 
 
 def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) -> None:
@@ -195,38 +199,6 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
             len(values) / math.ceil(values.nbytes / LARGEST_CHUNK)
         )  # equal parts, so that none is filled up
         group.create_dataset(name, data=values, chunks=(rows, *values.shape[1:]), fletcher32=True)
-
-
-def _replace(path: Path, content: memoryview) -> None:
-    """Write a file under a temporary name, flush it to the disk, and rename it over `path`.
-
-    There is one writer, so there is one temporary name; what a killed run left under it goes, and
-    so does a link.
-    """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        temporary.unlink(missing_ok=True)
-        with open(temporary, "xb") as stream:
-            stream.write(content)
-            stream.write(seal(content))
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise InputError(
-                f"{path}: cannot be written ({error.strerror or error}), expected a disk with "
-                "room and a folder that can be "
-                "written: what was saved before is still there, go on from it with resume"
-            ) from None
-        raise
 
 
 def _read(path: Path, file: h5py.File) -> Chain:
