@@ -34,7 +34,8 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import reject_outliers
 from bayesfred.reporting import html, plots
-from bayesfred.sampling.chainfile import Chain, open_chain
+from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import sample, searching, versions
 
 DEMO_NOTE = (
@@ -387,6 +388,7 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
         If the chain is missing, damaged, or named as its page or picture would be.
     """
     chain = open_chain(chain_file)
+    assert chain.path is not None, "read from a file"
     if chain.path in _beside(chain.path):
         raise InputError(
             f"{chain_file}: got a chain named as its report, which would replace it, expected "
@@ -588,6 +590,7 @@ def _report(
             f"prior-dominated: {', '.join(diagnostics.prior_dominated)}: the frame does not "
             "decide alone, see the report"
         )
+    assert chain.path is not None, "in a file"
     page, picture = _beside(chain.path)
     with _writing(page):
         html.write_report(

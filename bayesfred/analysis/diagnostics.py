@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from bayesfred._typing import Floats
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import fit_statistics
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]

@@ -23,7 +23,7 @@ from bayesfred.errors import printable
 from bayesfred.io.atomic import replace
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting import plots
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 
 __all__ = ["write_report"]
 

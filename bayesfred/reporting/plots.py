@@ -30,7 +30,7 @@ from bayesfred.analysis.ecdf_bands import band, ecdf, points
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.study_helpers import LEVELS
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 
 __all__ = [
     "calibration_plot",
