@@ -140,9 +140,7 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> None:
         )
     if run.simulation.grid is not None:
         s = posterior.model.sources
-        write_catalogue(
-            catalogue, CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite
-        )
+        write_catalogue(catalogue, CatalogueRecord(s.x, s.y, s.flux), overwrite=overwrite)
         print(f"{printable(str(catalogue))}: {len(s)} sources")
     write_frame(frame, posterior.counts, overwrite=overwrite)
     ny, nx = posterior.counts.shape
@@ -201,9 +199,7 @@ def _framed(
     """The posterior of the frame that a run file names, its maximum where clipping has found it, and what there is to say."""
     f = run.frame
     path = resolve(f.path, run_file, must_exist=True)
-    frame = read_frame(
-        path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
-    )
+    frame = read_frame(path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name)
     print(frame.description)
     ny, nx = frame.counts.shape
     psf = build.reference_psf(run, run_file)

@@ -254,12 +254,12 @@ class Run:
     def _advance(self, target_ess: float, steps: int | None) -> Iterator[float]:
         """Make steps until there are enough; after each, the share of what is wanted."""
         made = advance(self.near, self.estimate, self.start, self.steps)
-        due = checks()
-        # the checks fall on the same steps in a resumed run
-        check = next(n for n in due if n > len(self.steps))
+        due = checks()  # the same ones in a resumed run, so that it ends where it would have ended
+        check = next(n for n in due if n >= len(self.steps))
         enough, share = False, 0.0
-        if steps is None and self.steps:
+        if steps is None and len(self.steps) == check:
             enough, share = sufficient(self._positions(), target_ess)
+            check = next(due)
         while not enough and len(self.steps) < (MOST_STEPS if steps is None else steps):
             self.steps.append(next(made))  # all of a step or nothing, whenever an interrupt comes
             if steps is not None:
