@@ -146,7 +146,9 @@ def _information(
     information about it has no bound. A fall by exp(-g x) has the standard deviation 1/g; it stands
     for information that predicts less.
     """
-    information = posterior.information(params, fisher)
+    information = (
+        posterior.information(params) if fisher is None else posterior.information(params, fisher)
+    )
     known = np.diag(information).copy()
     room = np.where(
         gradient < 0.0, params - posterior.support[0], posterior.support[1] - params
