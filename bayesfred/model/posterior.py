@@ -40,6 +40,7 @@ from bayesfred.model.kernels.likelihood import (
     new_workspace,
 )
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, read_noise_model
+from bayesfred.model.parameters import Parameter, parameters
 
 FluxMode = Literal["fixed", "scale", "free"]
 
@@ -359,6 +360,11 @@ class Posterior:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of every parameter vector."""
         return (*self.model.distortion.names, "background", *self.nuisances.names)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Symbols and units, in the order of `parameter_names`."""
+        return parameters(self)
 
     @property
     def n_parameters(self) -> int:

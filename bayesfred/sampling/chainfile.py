@@ -26,8 +26,10 @@ import xarray as xr
 from bayesfred._typing import Floats, Ints, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
+from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.summary import summary
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
@@ -76,6 +78,10 @@ class Chain:
     def draws(self) -> Floats:
         """All draws after burn-in, shape (n, d)."""
         return self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
+
+    def summary(self) -> Table:
+        """What the draws say of every parameter, a row each, see `summary.summary`."""
+        return summary(self)
 
     def to_datatree(self) -> xr.DataTree:
         """The draws after burn-in for arviz: every walker of every ensemble is a chain."""
