@@ -262,7 +262,7 @@ def _fit_sentence(fit: Mapping[str, float]) -> str:
     """Say whether the model fits the counts."""
     excess = misfit(fit)
     side = "below" if excess < 0 else "above"
-    deviance = f"deviance {abs(excess):.3g} standard deviations {side} its expectation"
+    deviance = f"deviance {abs(excess):.1f} standard deviations {side} its expectation"
     if abs(excess) <= CONSISTENT:
         return f"The model fits the counts: {deviance}."
     return f"The model does not fit the counts: {deviance}, expected at most {CONSISTENT:.0f}."
