@@ -366,7 +366,9 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
     write_frame(tmp_path / "frame.fits", COUNTS)
     write_catalogue(tmp_path / "stars.csv", stars)
     before = (tmp_path / "frame.fits").read_bytes()
-    assert "frame.fits: exists, expected a new file" in message(write_frame, tmp_path / "frame.fits", COUNTS + 1)
+    assert "frame.fits: exists, expected a new file" in message(
+        write_frame, tmp_path / "frame.fits", COUNTS + 1
+    )
     assert "--overwrite" in message(write_catalogue, tmp_path / "stars.csv", stars)
     assert (tmp_path / "frame.fits").read_bytes() == before
     write_frame(tmp_path / "frame.fits", COUNTS + 1, overwrite=True)

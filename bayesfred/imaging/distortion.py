@@ -16,13 +16,14 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.serialize import serializable
 
 Exponents = tuple[int, int, int, int]
 
@@ -47,6 +48,7 @@ _PINHOLE_F = ((2, 0, 0, 0), (1, 1, 0, 0), (3, 0, 0, 0), (1, 2, 0, 0))
 _PINHOLE_G = ((1, 1, 0, 0), (0, 2, 0, 0), (2, 1, 0, 0), (0, 3, 0, 0))
 
 
+@serializable("distortion.polynomial")
 @dataclass(frozen=True)
 class PolynomialDistortion:
     """The terms of f and g; their coefficients theta are an argument of every method.
@@ -292,16 +294,6 @@ class PolynomialDistortion:
             )
 
         return _newton(residual, u, v)
-
-    def write(self, group: Any) -> None:
-        """Store the exponents in an HDF5 group: int64 datasets `f_terms` and `g_terms`, shape (n, 4)."""
-        group["f_terms"] = np.array(self.f_terms, dtype=np.int64).reshape(-1, 4)
-        group["g_terms"] = np.array(self.g_terms, dtype=np.int64).reshape(-1, 4)
-
-    @classmethod
-    def read(cls, group: Any) -> Self:
-        """Rebuild what `write` stored; InputError if the stored terms are not valid."""
-        return cls(np.asarray(group["f_terms"]).tolist(), np.asarray(group["g_terms"]).tolist())
 
     def _split(self, theta: ArrayLike) -> tuple[Floats, Floats]:
         """Theta's two halves, those of f and of g, after a check of its shape."""

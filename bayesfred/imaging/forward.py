@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +25,15 @@ from bayesfred.imaging.kernels.geometry import Optics, stride
 from bayesfred.imaging.kernels.jacobian import Basis, jacobian
 from bayesfred.imaging.kernels.render import image
 from bayesfred.imaging.logarithm import LogDistortion
-from bayesfred.imaging.psf import FWHM, PSF, read_psf
+from bayesfred.imaging.psf import FWHM, PSF
+from bayesfred.io.serialize import serializable
 
 # An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2):
 # 1 % at this width.
 NARROWEST_IMPULSE = math.sqrt(math.log(400.0) / (2.0 * math.pi**2))
 
 
+@serializable("model")
 @dataclass(frozen=True)
 class ForwardModel:
     """Expected counts of a distorted field of point sources.
@@ -225,22 +226,3 @@ class ForwardModel:
                 + ", ".join(self.distortion.names)
             )
         return values
-
-    def write(self, group: Any) -> None:
-        """Store the model in an HDF5 group."""
-        group.attrs["conserve_flux"] = self.conserve_flux
-        group.attrs["tolerance"] = self.tolerance
-        for name in ("detector", "sources", "psf", "distortion"):
-            getattr(self, name).write(group.create_group(name))
-
-    @classmethod
-    def read(cls, group: Any) -> "ForwardModel":
-        """The model stored in an HDF5 group by `write`."""
-        return cls(
-            Detector.read(group["detector"]),
-            SourceCatalog.read(group["sources"]),
-            read_psf(group["psf"]),
-            PolynomialDistortion.read(group["distortion"]),
-            conserve_flux=bool(group.attrs["conserve_flux"]),
-            tolerance=float(group.attrs["tolerance"]),
-        )

@@ -11,8 +11,10 @@ from scipy import optimize
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.serialize import serializable
 
 
+@serializable("distortion.logarithm")
 @dataclass(frozen=True)
 class LogDistortion:
     """f = x log(1 + c (u^2 + v^2)), g = y log(1 + c (u^2 + v^2)): barrel-shaped, without coefficients to fit.

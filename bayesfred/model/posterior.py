@@ -26,6 +26,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
 from bayesfred.imaging.kernels.jacobian import Basis
 from bayesfred.imaging.kernels.render import image
+from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
 from bayesfred.model.kernels.fisher import fisher
@@ -39,7 +40,7 @@ from bayesfred.model.kernels.likelihood import (
     clear,
     new_workspace,
 )
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise, read_noise_model
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
 
 FluxMode = Literal["fixed", "scale", "free"]
 
@@ -83,6 +84,7 @@ def one_thread() -> Iterator[None]:
         numba.set_num_threads(threads)
 
 
+@serializable("nuisances")
 @dataclass(frozen=True)
 class Nuisances:
     """What else is unknown beside the distortion and a constant background.
@@ -176,23 +178,6 @@ class Nuisances:
         """All nuisance parameters but the constant background."""
         return (*self.source_names, *self.background_names[1:])
 
-    def write(self, group: Any) -> None:
-        """Store the choices in an HDF5 group."""
-        for f in fields(self):
-            value = getattr(self, f.name)
-            group.attrs[f.name] = (
-                0.0 if value is None else np.bytes_(value) if isinstance(value, str) else value
-            )
-
-    @classmethod
-    def read(cls, group: Any) -> "Nuisances":
-        """The choices stored in an HDF5 group by `write`."""
-        a = group.attrs
-        footprint = float(a["footprint"]) or None
-        flux: Any = bytes(a["flux"]).decode()
-        order, scatter = int(a["background_order"]), bool(a["position_scatter"])
-        return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), order, footprint, scatter)
-
 
 def _usable(
     model: ForwardModel,
@@ -254,6 +239,7 @@ def _square(background: Floats) -> Floats:
     return np.array([[b[0], b[2], b[5]], [b[1], b[4], 0.0], [b[3], 0.0, 0.0]])
 
 
+@serializable("posterior")
 @dataclass(frozen=True, eq=False, init=False)
 class Posterior:
     """Posterior of distortion, background and nuisances given a frame.
@@ -772,23 +758,3 @@ class Posterior:
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    def write(self, group: Any) -> None:
-        """Store frame, mask, model, noise, nuisances and priors in an HDF5 group."""
-        group.create_dataset("counts", data=self.counts, fletcher32=True)
-        group.create_dataset("mask", data=self.mask, fletcher32=True)
-        for name in ("model", "noise", "nuisances"):
-            getattr(self, name).write(group.create_group(name))
-        priors.write(self.prior, group.create_group("prior"))
-
-    @classmethod
-    def read(cls, group: Any) -> "Posterior":
-        """The posterior stored in an HDF5 group by `write`."""
-        return cls(
-            ForwardModel.read(group["model"]),
-            group["counts"][()],
-            prior=priors.read(group["prior"]),
-            noise=read_noise_model(group["noise"]),
-            mask=group["mask"][()],
-            nuisances=Nuisances.read(group["nuisances"]),
-        )

@@ -183,26 +183,3 @@ def default_prior(
     if name == "position_scatter":
         return stats.gamma(2.0, scale=0.1 * sigma)
     return stats.norm(0.0, level)
-
-
-def write(prior: Mapping[str, Any], group: Any) -> None:
-    """Store priors in an HDF5 group: one attribute array (shapes..., loc, scale) a parameter, beside its family."""
-    for name, distribution in prior.items():
-        shapes, loc, scale = _standard(distribution)
-        item = group.create_group(name)
-        item.attrs["family"] = np.bytes_(distribution.dist.name)
-        item.attrs["parameters"] = [*shapes, loc, scale]
-
-
-def read(group: Any) -> dict[str, Any]:
-    """The priors stored in an HDF5 group by `write`."""
-    prior = {}
-    for name in group:
-        family, values = (
-            bytes(group[name].attrs["family"]).decode(),
-            [float(v) for v in group[name].attrs["parameters"]],
-        )
-        if family not in DENSITIES:
-            raise InputError(f"prior {name}: unknown family {family!r} in the file")
-        prior[name] = getattr(stats, family)(*values[:-2], loc=values[-2], scale=values[-1])
-    return prior
