@@ -255,7 +255,7 @@ def test_frames_larger_than_memory_are_refused_unread(tmp_path: Path, suffix: st
 def test_memory_is_asked_before_data_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a machine that has room for the bytes of a frame but not for its fit, every format is refused."""
+    """A machine may have room for the bytes of a frame but not for its fit."""
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 10, "SC_PAGE_SIZE": 100}.__getitem__)
     for suffix in FRAME_SUFFIXES:
         write_frame(tmp_path / f"frame{suffix}", COUNTS)

@@ -232,7 +232,7 @@ def _put_mapping(group: Any, value: Mapping[str, Any]) -> None:
 
 def _put_distribution(group: Any, value: Any) -> None:
     family = value.dist.name
-    if type(getattr(stats, family, None)) is not type(value.dist):
+    if len({type(getattr(stats, family, None)), type(value.dist)}) > 1:
         raise InputError(f"{family}: got a distribution of your own, expected one of scipy.stats")
     shapes, loc, scale = value.dist._parse_args(*value.args, **value.kwds)
     group.attrs["kind"] = _text(DISTRIBUTION)
@@ -241,9 +241,7 @@ def _put_distribution(group: Any, value: Any) -> None:
 
 
 def _wrong(group: Any, what: str) -> InputError:
-    return InputError(
-        f"damaged ({group.name}: {what}), expected it as it was written: {REMEDY}"
-    )
+    return InputError(f"damaged ({group.name}: {what}), expected it as it was written: {REMEDY}")
 
 
 def _get_group(group: Any) -> Any:
