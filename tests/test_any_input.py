@@ -374,7 +374,7 @@ def is_short(run_file: Path) -> bool:
 
 
 def check(files: Files, drawn: bool) -> None:
-    """Fit a folder of these files, beside a folder that must stay as it is; draw pictures or not."""
+    """Fit a folder of these files, beside a folder that must stay as it is; render or not."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name).resolve()
         precious, here = root / "precious", root / "here"

@@ -16,6 +16,7 @@ Nothing is pickled, and reading makes objects of registered classes only, throug
 constructors, which check what they are given.
 """
 
+import inspect
 import math
 import reprlib
 import types
@@ -352,11 +353,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint is float or hint is int:
         return type(value) is int or type(value) is hint
     known = origin or hint
-    if known is Any or not isinstance(known, type) or _is_opaque(known):
-        return True
-    return isinstance(value, known)
-
-
-def _is_opaque(hint: type) -> bool:
-    """Whether a class is a protocol that cannot be asked for its instances."""
-    return getattr(hint, "_is_protocol", False) and not getattr(hint, "_is_runtime_protocol", False)
+    if getattr(known, "_is_protocol", False):
+        names = [name for name in {**vars(known), **known.__annotations__} if name[0] != "_"]
+        return all(inspect.getattr_static(value, name, None) is not None for name in names)
+    return known is Any or not isinstance(known, type) or isinstance(value, known)

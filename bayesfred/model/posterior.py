@@ -334,7 +334,7 @@ class Posterior:
     def default_prior(self, name: str) -> Any:
         """The prior that a parameter has unless another is given."""
         m = self.model
-        return priors.default_prior(name, m.distortion, m.detector, self._level, m.psf.sigma)
+        return priors.default_prior(name, m.polynomial, m.detector, self._level, m.psf.sigma)
 
     @cached_property
     def _level(self) -> float:
@@ -502,7 +502,8 @@ class Posterior:
             background[0] += 0.5 * (squares / level - self._frame.pixels) / level
         terms = len(self.nuisances.background_names)
         scatter = [slope] if self.nuisances.position_scatter else []
-        out = np.concatenate([sources, scatter, background[:terms]])[self._order]
+        kernel = np.concatenate([sources, scatter, background[:terms]])
+        out = self.model.polynomial.pull_back(kernel)[self._order]
         if self.nuisances.flux == "scale":
             out[self.parameter_names.index("flux_scale")] /= arguments[1][0]
         out += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
@@ -545,8 +546,9 @@ class Posterior:
         if isinstance(self.noise, BackgroundNoise):
             k = self._basis.row.size
             out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
+        out = self.model.polynomial.pull_back(self.model.polynomial.pull_back(out).T)
         if self.nuisances.flux == "scale":
-            k = len(self.model.distortion.names)
+            k = self.model.distortion.n_terms
             out[k] /= arguments[1][0]
             out[:, k] /= arguments[1][0]
         return out[np.ix_(self._order, self._order)]
@@ -671,11 +673,9 @@ class Posterior:
                 if name in self.parameter_names:
                     values[:, k] = vectors[:, self.parameter_names.index(name)]
         background[:, 0] += self.noise.shift
-        return (
-            np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]),
-            nuisances,
-            background,
-        )
+        d = self.model.polynomial
+        theta = d.monomial_coefficients(vectors[:, : d.n_terms])
+        return np.ascontiguousarray(theta), nuisances, background
 
     @contextmanager
     def _workspace(self) -> Iterator[Workspace]:
