@@ -223,7 +223,7 @@ def _put_array(group: Any, name: str, value: Any) -> Any:
 
 def _put_mapping(group: Any, value: Mapping[str, Any]) -> None:
     for key in value:
-        if key in TAGS or not str(key).replace(".", "_").isidentifier():
+        if key in TAGS or not all(part.isidentifier() for part in str(key).split(".")):
             raise InputError(f"{key}: got a key that files cannot hold, expected an identifier")
     group.attrs["kind"] = _text(MAPPING)
     group.attrs["keys"] = np.array([_text(key) for key in value], dtype="S")
@@ -242,12 +242,16 @@ def _put_distribution(group: Any, value: Any) -> None:
 
 
 def _wrong(group: Any, what: str) -> InputError:
-    return InputError(f"damaged ({group.name}: {what}), expected it as it was written: {REMEDY}")
+    return InputError(
+        f"damaged ({group.name[-200:]}: {what}), expected it as it was written: {REMEDY}"
+    )
 
 
 def _get_group(group: Any) -> Any:
     """The object, mapping or distribution that a group holds."""
-    kind = _get_attribute(group.attrs["kind"]) if "kind" in group.attrs else None
+    kind = _get(group, "kind") if "kind" in group.attrs else None
+    if not isinstance(kind, str):
+        raise _wrong(group, "got a group without a kind, expected one that says what it holds")
     if kind == MAPPING:
         keys = _get(group, "keys")
         if not isinstance(keys, tuple) or not all(isinstance(key, str) for key in keys):
@@ -255,8 +259,6 @@ def _get_group(group: Any) -> Any:
         return {key: _get(group, key) for key in keys}
     if kind == DISTRIBUTION:
         return _get_distribution(group)
-    if not isinstance(kind, str):
-        raise _wrong(group, "got a group without a kind, expected one that says what it holds")
     cls = _classes.get(kind)
     if cls is None:
         known = ", ".join(sorted(_classes))
@@ -276,7 +278,7 @@ def _made(group: Any, make: Callable[..., Any], values: Mapping[str, Any]) -> An
     """What a constructor makes of stored values; whatever it raises becomes one line."""
     try:
         return make(**values)
-    except InputError:
+    except (InputError, RecursionError):
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -289,7 +291,7 @@ def _get(group: Any, name: str) -> Any:
         if name in group.attrs:
             return _get_attribute(group.attrs[name])
         node = group[name]
-    except InputError:
+    except (InputError, RecursionError):
         raise
     except Exception as error:  # h5py raises errors of many types
         reason = " ".join(str(error).split())[:200]
@@ -323,8 +325,11 @@ def _get_distribution(group: Any) -> Any:
     distribution = getattr(stats, family, None) if isinstance(family, str) else None
     if not isinstance(distribution, stats.rv_continuous):
         raise _wrong(group, f"got unknown family {family!r}, expected a continuous distribution")
-    if np.ndim(parameters) != 1 or len(parameters) < 2 or not np.isfinite(parameters).all():
-        raise _wrong(group, f"got parameters {parameters!r}, expected shapes, loc and scale")
+    numbers = isinstance(parameters, np.ndarray) and parameters.dtype.kind == "f"
+    if not (numbers and parameters.ndim == 1 < parameters.size and np.isfinite(parameters).all()):
+        raise _wrong(
+            group, f"got parameters {reprlib.repr(parameters)}, expected shapes, loc and scale"
+        )
     *shapes, loc, scale = map(float, parameters)
     frozen = _made(group, partial(distribution, *shapes), {"loc": loc, "scale": scale})
     if np.isnan(frozen.support()).any():
