@@ -23,7 +23,10 @@ from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError, printable
-from bayesfred.io import atomic, files, paths
+from bayesfred.io import atomic, paths
+from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
+from bayesfred.io.frames import write_frame
+from bayesfred.io.tables import TableRecord, write_table
 from bayesfred.pipeline import Result, Say, Simulated, Study, Verification
 from bayesfred.reporting import screen
 from bayesfred.reporting.studies import calibration_plot, noise_plot
@@ -110,9 +113,9 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     paths.may_write(frame, overwrite=overwrite, beside=(catalogue,) if grid else ())
     if grid:
         s = posterior.model.sources
-        record = files.CatalogueRecord(s.x, s.y, s.flux)
-        files.write_catalogue(catalogue, record, overwrite=overwrite)
-    files.write_frame(frame, posterior.counts, overwrite=overwrite)
+        record = CatalogueRecord(s.x, s.y, s.flux)
+        write_catalogue(catalogue, record, overwrite=overwrite)
+    write_frame(frame, posterior.counts, overwrite=overwrite)
     return Simulated(posterior, truth, frame, catalogue if grid else None)
 
 
@@ -233,8 +236,8 @@ def study(
         found, figure = result.cells, noise_plot(result, posterior.parameters)
     else:
         found, figure = result.quantities, calibration_plot(result, posterior.parameters)
-    record = files.TableRecord(found, {"study": kind, "message": result.message})
-    files.write_table(findings, record, overwrite=True)
+    record = TableRecord(found, {"study": kind, "message": result.message})
+    write_table(findings, record, overwrite=True)
     atomic.replace(picture, png(figure))
     return Study(result, table, findings, picture)
 

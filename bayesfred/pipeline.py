@@ -18,7 +18,7 @@ from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
-from bayesfred.io import atomic, files, paths
+from bayesfred.io import atomic, frames, paths
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -193,7 +193,7 @@ def read_frame(
 
     f = run.frame
     path = paths.resolve(f.path, run_file, must_exist=True)
-    frame = files.read_frame(
+    frame = frames.read_frame(
         path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
     note(frame.description)

@@ -25,7 +25,7 @@ from bayesfred.analysis.ecdf_bands import band, ecdf, points, uniformity
 from bayesfred.analysis.executor import Answer
 from bayesfred.analysis.study_helpers import given, seeds
 from bayesfred.errors import InputError
-from bayesfred.io import files
+from bayesfred.io import tables
 from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
 
@@ -574,7 +574,7 @@ def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> No
         progress=False,
     )
     assert dark.n == 3
-    rows = files.read_table(tmp_path / "l.ecsv").columns
+    rows = tables.read_table(tmp_path / "l.ecsv").columns
     assert np.all((rows["draws"] > 50) & (rows["draws"] < 200))
     assert np.all(np.isfinite(rows["log_likelihood.mean"]))
 
@@ -671,9 +671,9 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool
 def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]) -> None:
     assert study("replicates = 4\nbackground = [1, 10]\n")
     assert "8 frames, 0 failed" in capsys.readouterr().out
-    table = files.read_table("chains/run.noise.ecsv")
+    table = tables.read_table("chains/run.noise.ecsv")
     assert (table.meta["study"], table.columns["task"].size) == ("noise", 8)
-    assert sorted(set(files.read_table("chains/run.noise.summary.ecsv").columns["background"])) == [
+    assert sorted(set(tables.read_table("chains/run.noise.summary.ecsv").columns["background"])) == [
         1.0,
         10.0,
     ]
@@ -683,7 +683,7 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
     assert study("replicates = 5\nbackground = [1, 10]\n", resume=True)
     assert study("replicates = 10\n", kind="sbc")
     assert "calibrated: 10 frames" in capsys.readouterr().out
-    assert len(files.read_table("chains/run.sbc.summary.ecsv").columns["quantity"]) == 10
+    assert len(tables.read_table("chains/run.sbc.summary.ecsv").columns["quantity"]) == 10
     assert not study(
         "replicates = 2\npath = 'faint.ecsv'\n[prior.f_ux]\ndistribution = 'norm'\nloc = -0.5\n",
         kind="sbc",

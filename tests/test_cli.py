@@ -37,7 +37,7 @@ from bayesfred.cli import app
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.io import files
+from bayesfred.io import catalogues, frames
 from bayesfred.io.hdf5_checks import seal
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
@@ -153,8 +153,8 @@ def folder(simulated: Path, tmp_path: Path) -> Path:
 
 
 def test_simulated_frame_is_what_the_run_file_describes(simulated: Path) -> None:
-    frame = files.read_frame(simulated / "frame.fits")
-    stars = files.read_catalogue(simulated / "stars.csv")
+    frame = frames.read_frame(simulated / "frame.fits")
+    stars = catalogues.read_catalogue(simulated / "stars.csv")
     assert frame.counts.shape == (60, 75)
     assert sorted(set(stars.x)) == sorted(set(stars.y)) == [-16.0, 0.0, 16.0]
     assert set(stars.flux) == {5e3}
@@ -485,9 +485,9 @@ def spoil_pixel(value: float) -> Prepare:
     """Change one pixel of the frame, at row 5, column 7."""
 
     def prepare(folder: Path) -> None:
-        counts = files.read_frame(folder / "frame.fits").counts.copy()
+        counts = frames.read_frame(folder / "frame.fits").counts.copy()
         counts[5, 7] = value
-        files.write_frame(folder / "frame.fits", counts, overwrite=True)
+        frames.write_frame(folder / "frame.fits", counts, overwrite=True)
 
     return prepare
 
@@ -539,7 +539,7 @@ def frame_without_image(folder: Path) -> None:
 
 def frame_in_hdf5(folder: Path) -> None:
     """Put the frame where the chain would go."""
-    files.write_frame(folder / "run.h5", files.read_frame(folder / "frame.fits").counts)
+    frames.write_frame(folder / "run.h5", frames.read_frame(folder / "frame.fits").counts)
 
 
 def unchanged(folder: Path) -> None:
@@ -895,16 +895,16 @@ def page_text(path: Path) -> str:
 
 @pytest.mark.parametrize("suffix", [".fits.gz", ".fits.fz"])
 def test_compressed_frames_are_read(suffix: str, folder: Path) -> None:
-    files.write_frame(folder / f"frame{suffix}", files.read_frame(folder / "frame.fits").counts)
+    frames.write_frame(folder / f"frame{suffix}", frames.read_frame(folder / "frame.fits").counts)
     sections(frame=f'path = "frame{suffix}"')(folder)
     counts = read(folder)[0].counts
-    np.testing.assert_array_equal(counts, files.read_frame(folder / "frame.fits").counts)
+    np.testing.assert_array_equal(counts, frames.read_frame(folder / "frame.fits").counts)
 
 
 def test_saturated_and_lost_pixels_are_counted_on_screen_and_page(folder: Path) -> None:
-    counts = files.read_frame(folder / "frame.fits").counts.copy()
+    counts = frames.read_frame(folder / "frame.fits").counts.copy()
     counts[0, :3], counts[1, :2], counts[2, 0] = 5000.0, np.nan, np.inf
-    files.write_frame(folder / "frame.fits", counts, overwrite=True)
+    frames.write_frame(folder / "frame.fits", counts, overwrite=True)
     sections(frame='path = "frame.fits"\nsaturation = 5000', sampling=FEW_STEPS)(folder)
     output = invoke(folder, "fit", "run.toml")
     line = "frame.fits: 60 x 75 pixels, 6 masked (2 NaN, 1 infinite, 3 saturated)"
@@ -1298,10 +1298,10 @@ def test_ctrl_c_before_sampling(folder: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def with_bad_pixels(source: Path, target: Path, n: int) -> None:
     """Copy a frame with its first n pixels spoilt, which the description counts."""
-    counts: NDArray[np.float64] = files.read_frame(source).counts.copy()
+    counts: NDArray[np.float64] = frames.read_frame(source).counts.copy()
     counts[0, :n] = np.nan
     target.parent.mkdir(exist_ok=True)
-    files.write_frame(target, counts, overwrite=True)
+    frames.write_frame(target, counts, overwrite=True)
 
 
 def test_paths_are_beside_the_run_file_then_in_the_data_folder(

@@ -220,12 +220,16 @@ def test_everything_a_user_writes_is_escaped(tmp_path: Path) -> None:
     assert "script" not in page.tags
 
 
-def test_failed_write_leaves_the_old_page(tmp_path: Path) -> None:
-    (tmp_path / "report.html").mkdir()
-    (tmp_path / "report.html" / "old page").touch()
-    with pytest.raises(InputError, match=r"report\.html: cannot be written"):
+def test_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "report.html").write_text("old page")
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(InputError, match=r"report\.html: cannot be written \(disk full\)"):
         report(tmp_path, title="Another")
-    assert (tmp_path / "report.html" / "old page").exists()
+    assert (tmp_path / "report.html").read_text() == "old page"
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 

@@ -26,6 +26,7 @@ from test_model import make_model, make_posterior, make_truth
 from test_sampling_chain import TOTAL, assert_same_file, draws_of, run
 
 from bayesfred.errors import InputError
+from bayesfred.io import atomic
 from bayesfred.io.lock import only_writer
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -86,7 +87,7 @@ class Disk:
         for name in ("fsync", "replace", "open", "unlink"):
             patch.setattr(os, name, self.watched(name, getattr(os, name)))
         patch.setattr(
-            chainfile,
+            atomic,
             "open",
             lambda *args: Stream(self, self.watched("create", real_open)(*args)),
             raising=False,
@@ -183,12 +184,12 @@ def test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state(
 def test_a_checkpoint_that_is_not_atomic_fails_that_test(
     posterior: Posterior, old: Chain, new: Chain, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def in_place(target: Path, content: memoryview) -> None:
+    def in_place(target: Path, *content: bytes, sole_writer: bool) -> None:
         target.unlink()
-        with chainfile.open(target, "xb") as stream:  # type: ignore[attr-defined]
-            stream.write(content)
+        with atomic.open(target, "xb") as stream:  # type: ignore[attr-defined]
+            stream.write(content[0])
 
-    monkeypatch.setattr(chainfile, "_replace", in_place)
+    monkeypatch.setattr(chainfile, "replace", in_place)
     test_every_prefix = test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state
     with pytest.raises(InputError, match="no seal"):
         test_every_prefix(

@@ -1,19 +1,16 @@
-"""The chain file: one HDF5 file a run, which holds everything needed to judge, replay and go on with it.
+"""The chain file: one HDF5 file a run, with everything needed to judge, replay and resume it.
 
 Groups `ensemble_0`, ... are in emcee's own layout. Beside them stand the posterior itself (frame,
 mask, model, noise, nuisances, priors), the MAP, the seed and the versions of what made it. A
-checkpoint writes the whole file anew, from memory, and renames it over the old one, so that a
-reader finds either the old state or the new one. `examine.py` says what a file must be before it is
-read.
+checkpoint writes a whole new file from memory and renames it over the old one, so that a reader
+finds either the old state or the new one. `io.hdf5_checks` says what a file must be before it is
+read, and `io.serialize` stores the objects in it.
 """
 
 import hashlib
 import io
-import math
-import os
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +22,9 @@ import xarray as xr
 
 from bayesfred._typing import Floats, Ints, PathLike
 from bayesfred.errors import InputError
+from bayesfred.io.atomic import replace
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
+from bayesfred.io.serialize import read, write, write_array
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -33,7 +32,6 @@ from bayesfred.sampling.summary import summary
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
-LARGEST_CHUNK = 2**24  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ class Chain:
     def posterior(self) -> Posterior:
         """The posterior that was sampled, rebuilt from the file."""
         with open_checked(self.path) as file:
-            return Posterior.read(file["posterior"])
+            return read(file["posterior"], Posterior)
 
 
 def open_chain(path: PathLike) -> Chain:
@@ -121,7 +119,7 @@ def open_chain(path: PathLike) -> Chain:
     >>> open_chain("absent.h5")
     Traceback (most recent call last):
     ...
-    bayesfred.errors.InputError: absent.h5: no such file, expected a chain written by `bayesfred fit`: check the path
+    bayesfred.errors.InputError: absent.h5: no such file, expected a chain written by ...
     """
     with open_checked(Path(path)) as file:
         return _read(Path(path), file)
@@ -138,14 +136,14 @@ def random_states(path: Path) -> list[tuple[Any, ...]]:
 def fingerprint(posterior: Posterior) -> dict[str, str]:
     """A hash of each part of a posterior, to tell whether a chain belongs to it."""
     with h5py.File("fingerprint", "w", driver="core", backing_store=False) as file:
-        posterior.write(file)
-        return {name: _digest(file[name]) for name in file}
+        write(file, posterior)
+        return _digests(file)
 
 
 def changed_parts(path: Path, posterior: Posterior) -> list[str]:
     """Which parts of a posterior are not those that a chain file holds."""
     with open_checked(path) as file:
-        stored = {name: _digest(file["posterior"][name]) for name in file["posterior"]}
+        stored = _digests(file["posterior"])
     return [name for name, digest in fingerprint(posterior).items() if stored.get(name) != digest]
 
 
@@ -161,7 +159,21 @@ def check_same_posterior(path: Path, posterior: Posterior) -> None:
 
 
 def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, ...]]) -> None:
-    """Replace the chain's file by one that holds its present state; InputError if that cannot be written."""
+    """Replace the chain's file by one that holds its present state.
+
+    Parameters
+    ----------
+    chain : Chain
+    posterior : Posterior
+        What was sampled.
+    states : sequence of tuple
+        The state of every ensemble's random numbers.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
     content = io.BytesIO()  # so that a full disk meets plain writing, not HDF5 halfway through
     with h5py.File(content, "w", libver=FORMAT) as file:
         file.attrs.update(
@@ -177,12 +189,17 @@ def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, 
         versions.attrs.update(
             {name: np.bytes_(version) for name, version in chain.versions.items()}
         )
-        posterior.write(file.create_group("posterior"))
-        chain.estimate.write(file.create_group("estimate"))
+        write(file.create_group("posterior"), posterior)
+        write(file.create_group("estimate"), chain.estimate)
         for k, state in enumerate(states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
     with content.getbuffer() as written:
-        _replace(chain.path, written)
+        try:
+            replace(chain.path, written, seal(written), sole_writer=True)
+        except InputError as error:
+            raise InputError(
+                f"{error}: what was saved before is still there: resume from it"
+            ) from None
 
 
 def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) -> None:
@@ -197,42 +214,7 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
         ("log_prob", chain.log_prob[k]),
         ("accepted", chain.accepted[k].astype(float)),
     ):
-        rows = math.ceil(
-            len(values) / math.ceil(values.nbytes / LARGEST_CHUNK)
-        )  # equal parts, so that none is filled up
-        group.create_dataset(name, data=values, chunks=(rows, *values.shape[1:]), fletcher32=True)
-
-
-def _replace(path: Path, content: memoryview) -> None:
-    """Write a file under a temporary name, flush it to the disk, and rename it over `path`.
-
-    There is one writer, so there is one temporary name; what a killed run left under it goes, and
-    so does a link.
-    """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        temporary.unlink(missing_ok=True)
-        with open(temporary, "xb") as stream:
-            stream.write(content)
-            stream.write(seal(content))
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise InputError(
-                f"{path}: cannot be written ({error.strerror or error}), expected a disk with "
-                "room and a folder that can be "
-                "written: what was saved before is still there, go on from it with resume"
-            ) from None
-        raise
+        write_array(group, name, values)
 
 
 def _read(path: Path, file: h5py.File) -> Chain:
@@ -245,7 +227,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
         np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
         int(file.attrs["burn_in"]),
         int(file.attrs["seed"]),
-        MapEstimate.read(file["estimate"]),
+        read(file["estimate"], MapEstimate),
         {name: version.decode() for name, version in file["versions"].attrs.items()},
         float(file.attrs["target_ess"]),
         int(file.attrs["n_invalid"]),
@@ -285,12 +267,17 @@ def _random_state(attributes: Any) -> tuple[Any, ...]:
     return "MT19937", key.astype(np.uint32), int(position), int(has_gauss), float(gauss)
 
 
+def _digests(group: Any) -> dict[str, str]:
+    """A SHA-256 of each part of a stored object: names, attributes and data of all it holds."""
+    values = {name: value for name, value in group.attrs.items() if name != "kind"}
+    return {name: _digest(part) for name, part in {**values, **group}.items()}
+
+
 def _digest(item: Any) -> str:
-    """SHA-256 over names, attributes and data of an HDF5 item and all it holds."""
     digest = hashlib.sha256()
 
     def put(name: str, value: Any) -> None:
-        array = np.asarray(value)
+        array = np.asarray(() if isinstance(value, h5py.Empty) else value)
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
 
     def add(name: str, node: Any) -> None:
@@ -298,7 +285,10 @@ def _digest(item: Any) -> str:
             put(f"{name}@{key}", node.attrs[key])
         put(name, node[()] if isinstance(node, h5py.Dataset) else ())
 
-    add("", item)
+    if isinstance(item, h5py.Group | h5py.Dataset):
+        add("", item)
+    else:
+        put("", item)
     if isinstance(item, h5py.Group):
         item.visititems(add)
     return digest.hexdigest()
