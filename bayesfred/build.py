@@ -1,7 +1,8 @@
 """From the settings of a run file to the objects that they describe."""
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -10,15 +11,14 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError, printable
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
-from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import PSF, GaussianPSF, MoffatPSF, SampledPSF
+from bayesfred.imaging.psf import PSF
 from bayesfred.io.catalogues import read_catalogue
 from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
 from bayesfred.model import priors
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.noise import simulate
+from bayesfred.model.posterior import Posterior
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
 # deviations of a term's default prior. Sources whose light is farther from the frame than that are
@@ -55,12 +55,10 @@ def catalogue(
 
 def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
     """The PSF of [psf]."""
-    p = run.psf
-    if p.sigma is not None:
-        return GaussianPSF(p.sigma)
-    if p.fwhm is not None and p.beta is not None:
-        return MoffatPSF(p.fwhm, p.beta)
-    path = resolve(p.path or "", run_file, must_exist=True)
+    arrays = list(run.psf.given)
+    if not arrays:
+        return cast(PSF, run.psf.make())
+    path = resolve(run.psf.path, run_file, must_exist=True)
     image = read_frame(path, gain=1.0)
     if image.n_masked:
         raise InputError(
@@ -68,7 +66,7 @@ def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
             "fill them first"
         )
     try:
-        return SampledPSF(image.counts, p.oversampling or 0.0)
+        return cast(PSF, run.psf.make(**dict.fromkeys(arrays, image.counts)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -77,24 +75,11 @@ def forward_model(
     run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog, psf: PSF
 ) -> ForwardModel:
     """The forward model of [detector], [distortion] and [model]."""
-    d = run.distortion
-    if d.terms is None:
-        distortion = PolynomialDistortion(d.f_terms or (), d.g_terms or ())
-    elif d.degree is not None:
-        distortion = PolynomialDistortion.full_polynomial(d.degree)
-    else:
-        distortion = getattr(PolynomialDistortion, d.terms)()
-    detector = Detector(shape, binning=run.detector.binning, pixel=run.detector.pixel)
+    detector: Detector = run.detector.make(shape=shape)
+    distortion = run.distortion.make(radius=0.5 * math.hypot(*detector.fine_shape))
     m = run.model
     return ForwardModel(
         detector, sources, psf, distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance
-    )
-
-
-def noise_model(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
-    """The noise of [noise]."""
-    return (
-        BackgroundNoise() if run.noise.kind == "background" else PoissonNoise(run.noise.read_noise)
     )
 
 
@@ -110,17 +95,13 @@ def posterior_given(
     mask: Flags | None,
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
-    n = run.nuisances
-    nuisances = Nuisances(
-        n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint, n.position_scatter
-    )
     return Posterior(
         model,
         counts,
         prior=priors_given(run),
-        noise=noise_model(run),
+        noise=run.noise.make(),
         mask=mask,
-        nuisances=nuisances,
+        nuisances=run.nuisances.make(),
     )
 
 
@@ -142,7 +123,7 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
             f"{', '.join(model.distortion.names)}"
         )
     theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
-    noise = noise_model(run)
+    noise = run.noise.make()
     counts = simulate(model, theta, s.background, seed=seed, noise=noise)
     posterior = posterior_given(run, model, counts, None)
     known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}

@@ -255,7 +255,7 @@ def test_frames_larger_than_memory_are_refused_unread(tmp_path: Path, suffix: st
 def test_memory_is_asked_before_data_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a machine that has room for the bytes of a frame but not for its fit, every format is refused."""
+    """A machine may have room for the bytes of a frame but not for its fit."""
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 10, "SC_PAGE_SIZE": 100}.__getitem__)
     for suffix in FRAME_SUFFIXES:
         write_frame(tmp_path / f"frame{suffix}", COUNTS)
@@ -366,7 +366,9 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
     write_frame(tmp_path / "frame.fits", COUNTS)
     write_catalogue(tmp_path / "stars.csv", stars)
     before = (tmp_path / "frame.fits").read_bytes()
-    assert "frame.fits: exists, expected a new file" in message(write_frame, tmp_path / "frame.fits", COUNTS + 1)
+    assert "frame.fits: exists, expected a new file" in message(
+        write_frame, tmp_path / "frame.fits", COUNTS + 1
+    )
     assert "--overwrite" in message(write_catalogue, tmp_path / "stars.csv", stars)
     assert (tmp_path / "frame.fits").read_bytes() == before
     write_frame(tmp_path / "frame.fits", COUNTS + 1, overwrite=True)

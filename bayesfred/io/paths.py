@@ -137,9 +137,9 @@ def within(folder: PathLike, path: PathLike, where: str) -> Path:
 
     Examples
     --------
-    >>> within("commands", "night/one.h5", "run.toml: output.path").as_posix()
-    'runs/night/one.h5'
-    >>> within("commands", "../one.h5", "run.toml: output.path")
+    >>> within("chains", "night/one.h5", "run.toml: output.path").as_posix()
+    'chains/night/one.h5'
+    >>> within("chains", "../one.h5", "run.toml: output.path")
     Traceback (most recent call last):
     ...
     bayesfred.errors.InputError: run.toml: output.path: got '../one.h5', which leads out of ...

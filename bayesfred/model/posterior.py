@@ -26,6 +26,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
 from bayesfred.imaging.kernels.jacobian import Basis
 from bayesfred.imaging.kernels.render import image
+from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
 from bayesfred.model.kernels.fisher import fisher
@@ -39,7 +40,8 @@ from bayesfred.model.kernels.likelihood import (
     clear,
     new_workspace,
 )
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise, read_noise_model
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.parameters import Parameter, parameters
 
 FluxMode = Literal["fixed", "scale", "free"]
 
@@ -83,6 +85,7 @@ def one_thread() -> Iterator[None]:
         numba.set_num_threads(threads)
 
 
+@serializable("nuisances")
 @dataclass(frozen=True)
 class Nuisances:
     """What else is unknown beside the distortion and a constant background.
@@ -176,23 +179,6 @@ class Nuisances:
         """All nuisance parameters but the constant background."""
         return (*self.source_names, *self.background_names[1:])
 
-    def write(self, group: Any) -> None:
-        """Store the choices in an HDF5 group."""
-        for f in fields(self):
-            value = getattr(self, f.name)
-            group.attrs[f.name] = (
-                0.0 if value is None else np.bytes_(value) if isinstance(value, str) else value
-            )
-
-    @classmethod
-    def read(cls, group: Any) -> "Nuisances":
-        """The choices stored in an HDF5 group by `write`."""
-        a = group.attrs
-        footprint = float(a["footprint"]) or None
-        flux: Any = bytes(a["flux"]).decode()
-        order, scatter = int(a["background_order"]), bool(a["position_scatter"])
-        return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), order, footprint, scatter)
-
 
 def _usable(
     model: ForwardModel,
@@ -254,6 +240,7 @@ def _square(background: Floats) -> Floats:
     return np.array([[b[0], b[2], b[5]], [b[1], b[4], 0.0], [b[3], 0.0, 0.0]])
 
 
+@serializable("posterior")
 @dataclass(frozen=True, eq=False, init=False)
 class Posterior:
     """Posterior of distortion, background and nuisances given a frame.
@@ -348,7 +335,7 @@ class Posterior:
     def default_prior(self, name: str) -> Any:
         """The prior that a parameter has unless another is given."""
         m = self.model
-        return priors.default_prior(name, m.distortion, m.detector, self._level, m.psf.sigma)
+        return priors.default_prior(name, m.polynomial, m.detector, self._level, m.psf.sigma)
 
     @cached_property
     def _level(self) -> float:
@@ -359,6 +346,11 @@ class Posterior:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of every parameter vector."""
         return (*self.model.distortion.names, "background", *self.nuisances.names)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Symbols and units, in the order of `parameter_names`."""
+        return parameters(self)
 
     @property
     def n_parameters(self) -> int:
@@ -516,7 +508,8 @@ class Posterior:
             background[0] += 0.5 * (squares / level - self._frame.pixels) / level
         terms = len(self.nuisances.background_names)
         scatter = [slope] if self.nuisances.position_scatter else []
-        out = np.concatenate([sources, scatter, background[:terms]])[self._order]
+        kernel = np.concatenate([sources, scatter, background[:terms]])
+        out = self.model.polynomial.pull_back(kernel)[self._order]
         if self.nuisances.flux == "scale":
             out[self.parameter_names.index("flux_scale")] /= arguments[1][0]
         out += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
@@ -559,8 +552,9 @@ class Posterior:
         if isinstance(self.noise, BackgroundNoise):
             k = self._basis.row.size
             out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
+        out = self.model.polynomial.pull_back(self.model.polynomial.pull_back(out).T)
         if self.nuisances.flux == "scale":
-            k = len(self.model.distortion.names)
+            k = self.model.distortion.n_terms
             out[k] /= arguments[1][0]
             out[:, k] /= arguments[1][0]
         return out[np.ix_(self._order, self._order)]
@@ -685,11 +679,9 @@ class Posterior:
                 if name in self.parameter_names:
                     values[:, k] = vectors[:, self.parameter_names.index(name)]
         background[:, 0] += self.noise.shift
-        return (
-            np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]),
-            nuisances,
-            background,
-        )
+        d = self.model.polynomial
+        theta = d.monomial_coefficients(vectors[:, : d.n_terms])
+        return np.ascontiguousarray(theta), nuisances, background
 
     @contextmanager
     def _workspace(self) -> Iterator[Workspace]:
@@ -772,23 +764,3 @@ class Posterior:
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    def write(self, group: Any) -> None:
-        """Store frame, mask, model, noise, nuisances and priors in an HDF5 group."""
-        group.create_dataset("counts", data=self.counts, fletcher32=True)
-        group.create_dataset("mask", data=self.mask, fletcher32=True)
-        for name in ("model", "noise", "nuisances"):
-            getattr(self, name).write(group.create_group(name))
-        priors.write(self.prior, group.create_group("prior"))
-
-    @classmethod
-    def read(cls, group: Any) -> "Posterior":
-        """The posterior stored in an HDF5 group by `write`."""
-        return cls(
-            ForwardModel.read(group["model"]),
-            group["counts"][()],
-            prior=priors.read(group["prior"]),
-            noise=read_noise_model(group["noise"]),
-            mask=group["mask"][()],
-            nuisances=Nuisances.read(group["nuisances"]),
-        )

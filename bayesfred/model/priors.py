@@ -18,7 +18,6 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
-from bayesfred.imaging.logarithm import LogDistortion
 
 # log p up to a constant, d log p / dz and -d^2 log p / dz^2 in the standardised z = (x - loc) /
 # scale; s are the shape parameters.
@@ -137,15 +136,15 @@ def slope(distribution: Any, x: float) -> tuple[float, float]:
 
 def default_prior(
     name: str,
-    distortion: PolynomialDistortion | LogDistortion,
+    distortion: PolynomialDistortion,
     detector: Detector,
     level: float,
     sigma: float,
 ) -> Any:
     """The prior of a parameter for which the user gave none.
 
-    A distortion coefficient is normal with the scale at which its term moves a star at the frame's
-    corner by 10 % of the half-width along the term's axis, and so are the pointing offsets; the
+    A distortion coefficient is normal with the scale at which its term moves a star anywhere in the
+    frame by at most 10 % of the half-width along each axis, and so are the pointing offsets; the
     background is half-normal with ten times the frame's level, its slopes normal with that level; a
     common flux factor is log-normal by a factor e; the PSF's width is normal around the reference
     width by 30 %, cut at 0.6 and 2 times it. The scatter of the sources' positions is Gamma(2) with
@@ -155,7 +154,7 @@ def default_prior(
     Parameters
     ----------
     name : str
-    distortion : PolynomialDistortion or LogDistortion
+    distortion : PolynomialDistortion
     detector : Detector
     level : float, counts per pixel
         Typical level of the frame's counts.
@@ -170,8 +169,9 @@ def default_prior(
     ny, nx = detector.fine_shape
     half = {"f": 0.5 * nx, "g": 0.5 * ny}
     if name in distortion.names:
-        i, j, m, n = (*distortion.f_terms, *distortion.g_terms)[distortion.names.index(name)]
-        return stats.norm(0.0, 0.1 * half[name[0]] / (half["f"] ** (i + m) * half["g"] ** (j + n)))
+        largest = distortion.largest_displacement(half["f"], half["g"])
+        f, g = largest[:, distortion.names.index(name)]
+        return stats.norm(0.0, 0.1 / max(f / half["f"], g / half["g"]))
     if name.startswith("offset"):
         return stats.norm(0.0, 0.1 * half["f" if name == "offset_x" else "g"])
     if name == "background":
@@ -183,26 +183,3 @@ def default_prior(
     if name == "position_scatter":
         return stats.gamma(2.0, scale=0.1 * sigma)
     return stats.norm(0.0, level)
-
-
-def write(prior: Mapping[str, Any], group: Any) -> None:
-    """Store priors in an HDF5 group: one attribute array (shapes..., loc, scale) a parameter, beside its family."""
-    for name, distribution in prior.items():
-        shapes, loc, scale = _standard(distribution)
-        item = group.create_group(name)
-        item.attrs["family"] = np.bytes_(distribution.dist.name)
-        item.attrs["parameters"] = [*shapes, loc, scale]
-
-
-def read(group: Any) -> dict[str, Any]:
-    """The priors stored in an HDF5 group by `write`."""
-    prior = {}
-    for name in group:
-        family, values = (
-            bytes(group[name].attrs["family"]).decode(),
-            [float(v) for v in group[name].attrs["parameters"]],
-        )
-        if family not in DENSITIES:
-            raise InputError(f"prior {name}: unknown family {family!r} in the file")
-        prior[name] = getattr(stats, family)(*values[:-2], loc=values[-2], scale=values[-1])
-    return prior

@@ -26,7 +26,6 @@ from scipy import ndimage, spatial
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
-from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import image_positions
 from bayesfred.model.posterior import Posterior
@@ -112,10 +111,9 @@ class _Look:
         self.posterior, self.params = posterior, params
         self.width = s = np.hypot(model.psf.sigma / step, 12.0**-0.5)
         known = dict(zip(names, params, strict=True))
-        theta, offset = (
-            params[: model.distortion.n_terms].copy(),
-            [known.get(name, 0.0) for name in ("offset_x", "offset_y")],
-        )
+        d = model.polynomial
+        theta = d.monomial_coefficients(params[: d.n_terms].copy())
+        offset = [known.get(name, 0.0) for name in ("offset_x", "offset_y")]
         u, v = image_positions(model.optics(), theta, *offset, model.psf.sigma).T / step
         ny, nx = model.detector.shape
         self.places = np.stack([v + 0.5 * (ny - 1), u + 0.5 * (nx - 1)], axis=1)
@@ -194,12 +192,9 @@ class _Look:
     def _image(self, places: Floats, flux: Floats) -> Floats:
         """Spots as the sources' distortion makes them, shape (ny, nx); those that it cannot have made, as the PSF alone."""
         model = self.posterior.model
-        assert isinstance(model.distortion, PolynomialDistortion), (
-            "what is not polynomial is not fitted"
-        )
         theta = self.params[: model.distortion.n_terms]
         v, u = (places - 0.5 * (np.array(model.detector.shape) - 1.0)).T * model.detector.binning
-        x, y = model.distortion.object_position(theta, u, v)
+        x, y = model.polynomial.object_position(theta, u, v)
         bent = np.isfinite(x + y)
         image = _bright(model, theta, x[bent], y[bent], flux[bent])
         if not np.isfinite(image).all():

@@ -11,8 +11,10 @@ import arviz_base
 import xarray as xr
 
 from bayesfred._typing import Floats, Ints
+from bayesfred.io.summary_table import Table
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.summary import summary
 
 __all__ = ["Chain"]
 
@@ -76,6 +78,10 @@ class Chain:
     def draws(self) -> Floats:
         """All draws after burn-in, shape (n, d), parameter units."""
         return self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
+
+    def summary(self) -> Table:
+        """What the draws say of every parameter, a row each, see `summary.summary`."""
+        return summary(self)
 
     def to_datatree(self) -> xr.DataTree:
         """The draws after burn-in for arviz.

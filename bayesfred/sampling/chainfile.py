@@ -1,14 +1,14 @@
-"""The chain file: one HDF5 file for each run, with all that is needed to replay or resume it.
+"""The chain file: one HDF5 file a run, with everything needed to judge, replay and resume it.
 
 Groups `ensemble_0`, ... are in emcee's own layout. Beside them stand the posterior itself (frame,
-mask, model, noise, nuisances, priors), the MAP, the seed and the versions of what made the run. A
-checkpoint builds the whole file in memory and renames it over the old one, so that a reader finds
-either the old state or the new one. `io.hdf5_checks` says what a file must be before it is read.
+mask, model, noise, nuisances, priors), the MAP, the seed and the versions of what made it. A
+checkpoint writes a whole new file from memory and renames it over the old one, so that a reader
+finds either the old state or the new one. `io.hdf5_checks` says what a file must be before it is
+read, and `io.serialize` stores the objects in it.
 """
 
 import hashlib
 import io
-import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.atomic import replace
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
+from bayesfred.io.serialize import read, write, write_array
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
@@ -26,7 +27,6 @@ from bayesfred.sampling.chain import Chain
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
-LARGEST_CHUNK = 2**24  # bytes
 
 
 def open_chain(path: PathLike) -> Chain:
@@ -51,7 +51,7 @@ def open_chain(path: PathLike) -> Chain:
     >>> open_chain("absent.h5")
     Traceback (most recent call last):
     ...
-    bayesfred.errors.InputError: absent.h5: no such file, expected a chain ...
+    bayesfred.errors.InputError: absent.h5: no such file, expected a chain written by ...
     """
     with open_checked(Path(path)) as file:
         return _read(Path(path), file)
@@ -66,7 +66,7 @@ def fingerprint(posterior: TargetDensity) -> dict[str, str]:
         If no file can hold such a posterior.
     """
     with h5py.File(io.BytesIO(), "w") as file:  # without a name that other threads could use
-        _write_posterior(file, posterior)
+        write(file, posterior)
         return _digests(file)
 
 
@@ -106,8 +106,8 @@ def write_chain(chain: Chain) -> None:
         versions.attrs.update(
             {name: np.bytes_(version) for name, version in chain.versions.items()}
         )
-        _write_posterior(file.create_group("posterior"), chain.density)
-        chain.estimate.write(file.create_group("estimate"))
+        write(file.create_group("posterior"), chain.density)
+        write(file.create_group("estimate"), chain.estimate)
         for k, state in enumerate(chain.random_states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
     with content.getbuffer() as written:
@@ -117,15 +117,6 @@ def write_chain(chain: Chain) -> None:
             raise InputError(
                 f"{error}: what was saved before is still there: resume from it"
             ) from None
-
-
-def _write_posterior(group: Any, posterior: TargetDensity) -> None:
-    if not isinstance(posterior, Posterior):
-        raise InputError(
-            f"sampling: path: got one for a {type(posterior).__name__}, expected a posterior that "
-            "a file can hold: sample it in memory, without a path"
-        )
-    posterior.write(group)
 
 
 def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) -> None:
@@ -140,23 +131,21 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
         ("log_prob", chain.log_prob[k]),
         ("accepted", chain.accepted[k].astype(float)),
     ):
-        # equal parts, so that none is filled up
-        rows = math.ceil(len(values) / math.ceil(values.nbytes / LARGEST_CHUNK))
-        group.create_dataset(name, data=values, chunks=(rows, *values.shape[1:]), fletcher32=True)
+        write_array(group, name, values)
 
 
 def _read(path: Path, file: h5py.File) -> Chain:
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     chain = Chain(
         path=path,
-        density=Posterior.read(file["posterior"]),
+        density=read(file["posterior"], Posterior),
         chain=np.stack([g["chain"][()] for g in groups]),
         log_prob=np.stack([g["log_prob"][()] for g in groups]),
         accepted=np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
         random_states=tuple(_random_state(g.attrs) for g in groups),
         burn_in=int(file.attrs["burn_in"]),
         seed=int(file.attrs["seed"]),
-        estimate=MapEstimate.read(file["estimate"]),
+        estimate=read(file["estimate"], MapEstimate),
         versions={name: version.decode() for name, version in file["versions"].attrs.items()},
         target_ess=float(file.attrs["target_ess"]),
         n_invalid=int(file.attrs["n_invalid"]),
@@ -194,16 +183,16 @@ def _random_state(attributes: Any) -> tuple[Any, ...]:
 
 
 def _digests(group: Any) -> dict[str, str]:
-    """The hash of each item of an HDF5 group."""
-    return {name: _digest(group[name]) for name in group}
+    """A SHA-256 of each part of a stored object: names, attributes and data of all it holds."""
+    values = {name: value for name, value in group.attrs.items() if name != "kind"}
+    return {name: _digest(part) for name, part in {**values, **group}.items()}
 
 
 def _digest(item: Any) -> str:
-    """SHA-256 over names, attributes and data of an HDF5 item and all it holds."""
     digest = hashlib.sha256()
 
     def put(name: str, value: Any) -> None:
-        array = np.asarray(value)
+        array = np.asarray(() if isinstance(value, h5py.Empty) else value)
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
 
     def add(name: str, node: Any) -> None:
@@ -211,7 +200,10 @@ def _digest(item: Any) -> str:
             put(f"{name}@{key}", node.attrs[key])
         put(name, node[()] if isinstance(node, h5py.Dataset) else ())
 
-    add("", item)
+    if isinstance(item, h5py.Group | h5py.Dataset):
+        add("", item)
+    else:
+        put("", item)
     if isinstance(item, h5py.Group):
         item.visititems(add)
     return digest.hexdigest()

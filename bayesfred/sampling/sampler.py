@@ -136,7 +136,10 @@ def sample(
             raise InputError(
                 f"{path}: no folder {path.parent}, expected one to write the chain to: create it"
             )
-        parts = fingerprint(posterior)  # raises where no file can hold it
+        try:
+            parts = fingerprint(posterior)
+        except InputError as error:  # no file can hold it
+            raise InputError(f"{path}: {error}, or sample it in memory, without a path") from None
         with only_writer(path):
             if may_write(path, resume=resume, overwrite=overwrite):
                 chain = open_chain(path)
