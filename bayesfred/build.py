@@ -1,7 +1,8 @@
 """From the settings of a run file to the objects that they describe."""
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -10,13 +11,13 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError, printable
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
-from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import PSF, GaussianPSF, MoffatPSF, SampledPSF
-from bayesfred.io import files
+from bayesfred.imaging.psf import PSF
+from bayesfred.io.catalogues import read_catalogue
+from bayesfred.io.frames import read_frame, require_memory
+from bayesfred.io.paths import resolve
 from bayesfred.model import priors
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.model.parameters import Nuisances
+from bayesfred.model.noise import simulate
 from bayesfred.model.posterior import Posterior
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
@@ -34,8 +35,8 @@ def catalogue(
     and the frame; and outside if no light reaches the frame from an image that stands `STRAY`
     nearer. If all are outside, all are kept: the posterior says so.
     """
-    c, path = run.catalogue, settings.resolve(run.catalogue.path, run_file, must_exist=True)
-    record = files.read_catalogue(
+    c, path = run.catalogue, resolve(run.catalogue.path, run_file, must_exist=True)
+    record = read_catalogue(
         path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point
     )
     half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
@@ -54,20 +55,18 @@ def catalogue(
 
 def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
     """The PSF of [psf]."""
-    p = run.psf
-    if p.sigma is not None:
-        return GaussianPSF(p.sigma)
-    if p.fwhm is not None and p.beta is not None:
-        return MoffatPSF(p.fwhm, p.beta)
-    path = settings.resolve(p.path or "", run_file, must_exist=True)
-    image = files.read_frame(path, gain=1.0)
+    arrays = list(run.psf.given)
+    if not arrays:
+        return cast(PSF, run.psf.make())
+    path = resolve(run.psf.path, run_file, must_exist=True)
+    image = read_frame(path, gain=1.0)
     if image.n_masked:
         raise InputError(
             f"{path}: got {image.n_masked} pixels that are not finite, expected samples of a PSF: "
             "fill them first"
         )
     try:
-        return SampledPSF(image.counts, p.oversampling or 0.0)
+        return cast(PSF, run.psf.make(**dict.fromkeys(arrays, image.counts)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -76,24 +75,11 @@ def forward_model(
     run: settings.RunSettings, shape: tuple[int, int], sources: SourceCatalog, psf: PSF
 ) -> ForwardModel:
     """The forward model of [detector], [distortion] and [model]."""
-    d = run.distortion
-    if d.terms is None:
-        distortion = PolynomialDistortion(d.f_terms or (), d.g_terms or ())
-    elif d.degree is not None:
-        distortion = PolynomialDistortion.full_polynomial(d.degree)
-    else:
-        distortion = getattr(PolynomialDistortion, d.terms)()
-    detector = Detector(shape, binning=run.detector.binning, pixel=run.detector.pixel)
+    detector: Detector = run.detector.make(shape=shape)
+    distortion = run.distortion.make(radius=0.5 * math.hypot(*detector.fine_shape))
     m = run.model
     return ForwardModel(
         detector, sources, psf, distortion, conserve_flux=m.conserve_flux, tolerance=m.tolerance
-    )
-
-
-def noise_model(run: settings.RunSettings) -> PoissonNoise | BackgroundNoise:
-    """The noise of [noise]."""
-    return (
-        BackgroundNoise() if run.noise.kind == "background" else PoissonNoise(run.noise.read_noise)
     )
 
 
@@ -109,17 +95,13 @@ def posterior_given(
     mask: Flags | None,
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
-    n = run.nuisances
-    nuisances = Nuisances(
-        n.flux, n.offset, n.psf_sigma, n.background_order, n.footprint, n.position_scatter
-    )
     return Posterior(
         model,
         counts,
         prior=priors_given(run),
-        noise=noise_model(run),
+        noise=run.noise.make(),
         mask=mask,
-        nuisances=nuisances,
+        nuisances=run.nuisances.make(),
     )
 
 
@@ -127,7 +109,7 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
     """A simulated frame's posterior and the true parameters."""
     s = run.simulation
     assert s is not None, "checked by the callers"
-    files.require_memory(f"{run_file}: simulation.shape", s.shape)
+    require_memory(f"{run_file}: simulation.shape", s.shape)
     psf = reference_psf(run, run_file)
     if s.grid:
         sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)
@@ -141,7 +123,7 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
             f"{', '.join(model.distortion.names)}"
         )
     theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
-    noise = noise_model(run)
+    noise = run.noise.make()
     counts = simulate(model, theta, s.background, seed=seed, noise=noise)
     posterior = posterior_given(run, model, counts, None)
     known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}

@@ -1,53 +1,50 @@
 """The run file: one TOML file that says what a run fits, to what, and how.
 
 Each section is a frozen model with the keys, units and defaults of the run file;
-:func:`read_settings` checks all of them at once and says every mistake in one line. Settings know
-only plain values: the command line turns them into a model, `model_dump_json` turns them into the
-text that result files keep, and :func:`resolve` finds the files they name. `example.toml` beside
-this module is a complete run file. Frames and catalogues are read in `bayesfred.io.files`.
+:func:`read_settings` checks all of them at once and says every mistake in one line. The sections
+`[detector]`, `[psf]`, `[noise]` and `[nuisances]` have the fields of the class that they describe,
+see `sections`; `kind` names the class. `build` makes the objects. `model_dump_json` gives the text
+that result files keep. `example.toml` beside this module is a complete run file.
 """
 
 from __future__ import annotations
 
-import difflib
-import errno
-import inspect
 import json
-import os
-import re
-import reprlib
 import tomllib
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
+from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.sections import LARGEST, TOO_DEEP, Float, Name, Section, described, mistake
 
-__all__ = ["PriorSettings", "RunSettings", "read_settings", "resolve", "within"]
+__all__ = ["PriorSettings", "RunSettings", "read_settings"]
 
-# Far outside what frames need, and far inside what float64, int64 and memory hold.
-_LARGEST = 1e15
-_Name = Annotated[str, Field(min_length=1, max_length=1000)]
-_Float = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
-_Positive = Annotated[float, Field(gt=0, le=_LARGEST)]
-_NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
+_Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+_NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 _Count = Annotated[int, Field(ge=1, le=10**15)]
-_Binning = Annotated[int, Field(ge=1, le=1000)]
 _Power = Annotated[int, Field(ge=0, le=10)]
 _Seed = Annotated[int, Field(ge=0, lt=2**63)]
 _Term = tuple[_Power, _Power, _Power, _Power]
 
-_TOO_DEEP = "got tables or arrays nested too deeply, expected sections of key = value"
+# Sections with the fields of a class: `ObjectSettings`.
+_Detector = Annotated[Any, PlainValidator(partial(described, "detector"))]
+_PSF = Annotated[Any, PlainValidator(partial(described, "psf"))]
+_Noise = Annotated[Any, PlainValidator(partial(described, "noise"))]
+_Nuisances = Annotated[Any, PlainValidator(partial(described, "nuisances"))]
+
+_Basis = Literal[
+    "mirrored", "paper", "pinhole", "radial_tangential", "polynomial", "full_polynomial", "zernike"
+]
+_WITH_DEGREE = ("polynomial", "full_polynomial", "zernike")
 
 
-class _Section(BaseModel):
-    # strict: TOML has types of its own, so 'true' or '3' is never taken for a number.
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class FrameSettings(_Section):
-    """`[frame]`: the frame of counts, as `bayesfred.io.files.read_frame` takes it.
+class FrameSettings(Section):
+    """`[frame]`: the frame of counts, as `bayesfred.io.frames.read_frame` takes it.
 
     Attributes
     ----------
@@ -66,16 +63,16 @@ class FrameSettings(_Section):
         `bayesfred.reject_outliers`.
     """
 
-    path: _Name
+    path: Name
     gain: _Positive | None = None
-    pedestal: _Float = 0.0
-    saturation: _Float | None = None
-    name: _Name | None = None
+    pedestal: Float = 0.0
+    saturation: Float | None = None
+    name: Name | None = None
     reject_outliers: bool = False
 
 
-class CatalogueSettings(_Section):
-    """`[catalogue]`: the known sources, as `bayesfred.io.files.read_catalogue` takes them.
+class CatalogueSettings(Section):
+    """`[catalogue]`: the known sources, as `io.catalogues.read_catalogue` takes them.
 
     Attributes
     ----------
@@ -91,12 +88,12 @@ class CatalogueSettings(_Section):
         Magnitude of a source of one count; goes with `magnitude`.
     """
 
-    path: _Name
-    x: _Name = "x"
-    y: _Name = "y"
-    flux: _Name = "flux"
-    magnitude: _Name | None = None
-    zero_point: _Float | None = None
+    path: Name
+    x: Name = "x"
+    y: Name = "y"
+    flux: Name = "flux"
+    magnitude: Name | None = None
+    zero_point: Float | None = None
 
     @model_validator(mode="after")
     def _both_or_neither(self) -> CatalogueSettings:
@@ -106,83 +103,21 @@ class CatalogueSettings(_Section):
         return self
 
 
-class DetectorSettings(_Section):
-    """`[detector]`: how pixels record light.
-
-    Attributes
-    ----------
-    pixel : {'impulse', 'box'}
-        The image at the pixel's centre, or its integral over the pixel.
-    binning : int
-        Fine pixels a side in each recorded pixel.
-    """
-
-    pixel: Literal["impulse", "box"] = "impulse"
-    binning: _Binning = 1
-
-
-class PSFSettings(_Section):
-    """`[psf]`: the reference PSF, in pixels of the fine grid.
-
-    Attributes
-    ----------
-    kind : {'gaussian', 'moffat', 'sampled'}
-        Which of `GaussianPSF`, `MoffatPSF` and `SampledPSF` it is.
-    sigma : float, pixel
-        Of a Gaussian: standard deviation.
-    fwhm : float, pixel
-        Of a Moffat function: full width at half maximum.
-    beta : float
-        Exponent of its wings.
-    path : str
-        Of a sampled PSF: file of its samples, an image such as a frame's, its sides odd numbers of
-        pixels.
-    oversampling : float
-        Samples per pixel.
-    """
-
-    kind: Literal["gaussian", "moffat", "sampled"] = "gaussian"
-    sigma: _Positive | None = None
-    fwhm: _Positive | None = None
-    beta: Annotated[float, Field(gt=1, le=100)] | None = None
-    path: _Name | None = None
-    oversampling: Annotated[float, Field(ge=1, le=1001)] | None = None
-
-    @model_validator(mode="after")
-    def _keys_of_the_kind(self) -> PSFSettings:
-        wanted = {
-            "gaussian": ["sigma"],
-            "moffat": ["fwhm", "beta"],
-            "sampled": ["path", "oversampling"],
-        }[self.kind]
-        given = [
-            key
-            for key in ("sigma", "fwhm", "beta", "path", "oversampling")
-            if getattr(self, key) is not None
-        ]
-        if given != wanted:
-            raise ValueError(
-                f"got {' and '.join(given) or 'no width'}, expected {' and '.join(wanted)} with "
-                f"kind = '{self.kind}'"
-            )
-        return self
-
-
-class DistortionSettings(_Section):
+class DistortionSettings(Section):
     """`[distortion]`: the terms of f and g, named as a basis or listed.
 
     Attributes
     ----------
-    terms : {'mirrored', 'paper', 'pinhole', 'full_polynomial'}, optional
-        A basis by name.
+    terms : str, optional
+        A basis by name: a constructor of `PolynomialDistortion`.
     degree : int, optional
-        Highest total degree of the 'full_polynomial' basis.
+        Highest degree of a 'polynomial', 'full_polynomial' or 'zernike' basis.
     f_terms, g_terms : tuple of (i, j, m, n), optional
         Powers of x, y, u, v, one entry a term.
     """
 
-    terms: Literal["mirrored", "paper", "pinhole", "full_polynomial"] | None = None
-    degree: Annotated[int, Field(ge=2, le=10)] | None = None
+    terms: _Basis | None = None
+    degree: Annotated[int, Field(ge=1, le=10)] | None = None
     f_terms: tuple[_Term, ...] | None = None
     g_terms: tuple[_Term, ...] | None = None
 
@@ -192,18 +127,39 @@ class DistortionSettings(_Section):
         if given not in (["terms"], ["f_terms", "g_terms"]):
             got = " and ".join(given) or "no terms"
             raise ValueError(f"got {got}, expected either terms, or both f_terms and g_terms")
-        if self.terms == "full_polynomial" and self.degree is None:
-            raise ValueError("got no degree, expected one with terms = 'full_polynomial'")
-        if self.terms != "full_polynomial" and self.degree is not None:
-            raise ValueError(
-                f"got degree {self.degree}, expected it with terms = 'full_polynomial' only"
-            )
+        if self.terms in _WITH_DEGREE and self.degree is None:
+            raise ValueError(f"got no degree, expected one with terms = {self.terms!r}")
+        if self.terms not in _WITH_DEGREE and self.degree is not None:
+            names = " or ".join(map(repr, _WITH_DEGREE))
+            raise ValueError(f"got degree {self.degree}, expected it with terms = {names} only")
         if not self.terms and not self.f_terms and not self.g_terms:
             raise ValueError("got f_terms and g_terms empty, expected at least one term")
+        self.make(1.0)
         return self
 
+    def make(self, radius: float) -> PolynomialDistortion:
+        """Make the distortion.
 
-class ModelSettings(_Section):
+        Parameters
+        ----------
+        radius : float, pixel
+            Half the frame's diagonal, for the bases that need a unit of length.
+
+        Raises
+        ------
+        InputError
+            A term is not allowed, or the degree is too low.
+        """
+        if self.terms is None:
+            return PolynomialDistortion(self.f_terms or (), self.g_terms or ())
+        keywords: dict[str, Any] = {} if self.degree is None else {"degree": self.degree}
+        if self.terms == "zernike":
+            keywords["radius"] = radius
+        made: PolynomialDistortion = getattr(PolynomialDistortion, self.terms)(**keywords)
+        return made
+
+
+class ModelSettings(Section):
     """`[model]`: how expected counts are computed.
 
     Attributes
@@ -218,59 +174,7 @@ class ModelSettings(_Section):
     tolerance: Annotated[float, Field(ge=0, lt=1)] = 1e-8
 
 
-class NoiseSettings(_Section):
-    """`[noise]`: the noise of the counts.
-
-    Attributes
-    ----------
-    kind : {'poisson', 'background'}
-        Poisson counts, or the paper's case in which the background alone is noisy.
-    read_noise : float, e-
-        Standard deviation of the read noise, with 'poisson' only.
-    """
-
-    kind: Literal["poisson", "background"] = "poisson"
-    read_noise: _NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _read_noise_is_poisson(self) -> NoiseSettings:
-        if self.kind == "background" and self.read_noise > 0:
-            raise ValueError(
-                f"got read_noise {self.read_noise}, expected it with kind = 'poisson' only"
-            )
-        return self
-
-
-class NuisanceSettings(_Section):
-    """`[nuisances]`: what a real frame leaves unknown besides the distortion.
-
-    Attributes
-    ----------
-    flux : {'fixed', 'scale', 'free'}
-        Fluxes as catalogued, times one common factor, or free for each source.
-    offset : bool
-        Whether a common shift of all sources is fitted.
-    psf_sigma : bool
-        Whether the PSF's width is fitted, whatever its kind: that of the Gaussian as wide at half
-        maximum.
-    background_order : {0, 1, 2}
-        Order of the background's polynomial over the frame.
-    footprint : float, optional, pixel
-        Keep only pixels this near to a catalogued source.
-    position_scatter : bool
-        Whether sources lie off their catalogue positions, by errors of unknown standard deviation;
-        with free fluxes.
-    """
-
-    flux: Literal["fixed", "scale", "free"] = "fixed"
-    offset: bool = False
-    psf_sigma: bool = False
-    background_order: Literal[0, 1, 2] = 0
-    footprint: _Positive | None = None
-    position_scatter: bool = False
-
-
-class PriorSettings(_Section):
+class PriorSettings(Section):
     """`[prior.NAME]`: the prior of one parameter, a distribution of `scipy.stats`.
 
     Attributes
@@ -283,7 +187,7 @@ class PriorSettings(_Section):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float] = Field(init=False)
 
-    distribution: _Name
+    distribution: Name
 
     @property
     def keywords(self) -> dict[str, float]:
@@ -291,7 +195,7 @@ class PriorSettings(_Section):
         return dict(self.__pydantic_extra__)
 
 
-class SamplingSettings(_Section):
+class SamplingSettings(Section):
     """`[sampling]`: how long and how widely to sample.
 
     Attributes
@@ -315,7 +219,7 @@ class SamplingSettings(_Section):
     steps: _Count | None = None
 
 
-class OutputSettings(_Section):
+class OutputSettings(Section):
     """`[output]`: where the run is stored.
 
     Attributes
@@ -327,7 +231,7 @@ class OutputSettings(_Section):
     path: Annotated[str, Field(pattern=r"\.h5$")] | None = None
 
 
-class GridSettings(_Section):
+class GridSettings(Section):
     """`[simulation.grid]`: a square grid of sources, written as the catalogue.
 
     Attributes
@@ -345,8 +249,8 @@ class GridSettings(_Section):
     flux: _Positive
 
 
-class SimulationSettings(_Section):
-    """`[simulation]`: the truth that `bayesfred simulate` draws a frame from.
+class SimulationSettings(Section):
+    """`[simulation]`: the truth of which `bayesfred simulate` makes a frame.
 
     Attributes
     ----------
@@ -363,13 +267,13 @@ class SimulationSettings(_Section):
     """
 
     shape: tuple[_Count, _Count]
-    theta: dict[str, _Float]
+    theta: dict[str, Float]
     background: _NotNegative
     seed: _Seed = 1
     grid: GridSettings | None = None
 
 
-class StudySettings(_Section):
+class StudySettings(Section):
     """`[study]`: what `bayesfred study` simulates and fits.
 
     Attributes
@@ -410,7 +314,7 @@ class StudySettings(_Section):
     path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None
 
 
-class RunSettings(_Section):
+class RunSettings(Section):
     """A whole run file, one attribute a section.
 
     Attributes
@@ -429,25 +333,25 @@ class RunSettings(_Section):
 
     frame: FrameSettings
     catalogue: CatalogueSettings
-    detector: DetectorSettings = DetectorSettings()
-    psf: PSFSettings
+    detector: _Detector = described("detector", {})
+    psf: _PSF
     distortion: DistortionSettings
     model: ModelSettings = ModelSettings()
-    noise: NoiseSettings = NoiseSettings()
-    nuisances: NuisanceSettings = NuisanceSettings()
-    prior: dict[str, PriorSettings] = {}
+    noise: _Noise = described("noise", {})
+    nuisances: _Nuisances = described("nuisances", {})
+    prior: dict[str, PriorSettings] = Field(default_factory=dict)
     sampling: SamplingSettings = SamplingSettings()
     output: OutputSettings = OutputSettings()
     simulation: SimulationSettings | None = None
     study: StudySettings | None = None
 
 
-def read_settings(path: str | Path) -> RunSettings:
+def read_settings(path: PathLike) -> RunSettings:
     """Read and check a run file.
 
     Parameters
     ----------
-    path : str or Path
+    path : path-like
         A TOML file such as `example.toml` beside this module.
 
     Returns
@@ -462,11 +366,8 @@ def read_settings(path: str | Path) -> RunSettings:
 
     Examples
     --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     run_file = Path(folder, "run.toml")
-    ...     _ = run_file.write_text(Path(inspect.getfile(read_settings)).with_name("example.toml").read_text())
-    ...     read_settings(run_file).psf.sigma
+    >>> import bayesfred.settings
+    >>> read_settings(Path(bayesfred.settings.__file__).with_name("example.toml")).psf.sigma
     10.0
     """
     path = Path(path)
@@ -485,139 +386,14 @@ def read_settings(path: str | Path) -> RunSettings:
             f"{path}: cannot be read ({error.strerror}), expected a run file"
         ) from error
     except RecursionError:
-        raise InputError(f"{path}: {_TOO_DEEP}") from None
+        raise InputError(f"{path}: {TOO_DEEP}") from None
     except ValidationError as error:
-        mistakes = "; ".join(_mistake(details) for details in error.errors(include_url=False))
+        errors = error.errors(include_url=False)
+        mistakes = "; ".join(mistake(details, RunSettings, table) for details in errors)
         raise InputError(" ".join(f"{path}: {mistakes}".split())) from None
-    except (
-        ValueError
-    ) as error:  # TOML syntax (its text gives line and column) and text that is not UTF-8
+    # TOML syntax (its text gives line and column) and text that is not UTF-8
+    except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"{path}: not TOML ({reason}), expected sections of key = value"
         ) from error
-
-
-def resolve(path: str | Path, run_file: str | Path, *, must_exist: bool = False) -> Path:
-    """Find a file that a run file names.
-
-    Parameters
-    ----------
-    path : str or Path
-        As the run file gives it. An absolute path stays; a relative one is looked up beside the run
-        file, then in the folder that the environment variable BAYESFRED_DATA names.
-    run_file : str or Path
-        The run file.
-    must_exist : bool
-        Raise where nothing is found, and say where it was sought.
-
-    Returns
-    -------
-    Path
-        The file found, or else the place beside the run file.
-
-    Raises
-    ------
-    InputError
-        With `must_exist`, where there is no such file.
-
-    Examples
-    --------
-    >>> resolve("frame.fits", "no_such_folder/run.toml").as_posix()
-    'no_such_folder/frame.fits'
-    """
-    folder = os.environ.get("BAYESFRED_DATA")
-    places = [Path(run_file).parent / path]
-    if folder and not Path(path).is_absolute():
-        places.append(Path(folder) / path)
-    found = next(
-        (place for place in places if os.path.exists(place)), None
-    )  # unlike Path.exists, whatever the path
-    if found is None and must_exist:
-        remedy = "check the path"
-        if not Path(path).is_absolute():
-            remedy += " or set BAYESFRED_DATA to the folder that holds it"
-        tried = " or ".join(map(str, places))
-        raise InputError(f"{run_file}: got {str(path)!r}, expected a file at {tried}; {remedy}")
-    return found or places[0]
-
-
-def within(folder: str | Path, path: str | Path, where: str) -> Path:
-    """Find the place of a file to write, which a run file names but must not choose outside a folder.
-
-    Parameters
-    ----------
-    folder : str or Path
-        The folder.
-    path : str or Path
-        As the run file gives it, relative to the folder.
-    where : str
-        Run file and key, to begin the line with.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    InputError
-        The path leads out of the folder, by being absolute, by .. or through links, or it is no
-        path.
-
-    Examples
-    --------
-    >>> within("commands", "night/one.h5", "run.toml: output.path").as_posix()
-    'runs/night/one.h5'
-    >>> within("commands", "../one.h5", "run.toml: output.path")
-    Traceback (most recent call last):
-    ...
-    bayesfred.errors.InputError: run.toml: output.path: got '../one.h5', which leads out of ..., expected a path that stays inside
-    """
-    place = Path(folder) / path
-    inside = False
-    try:
-        inside = place.resolve().is_relative_to(Path(folder).resolve())
-        os.stat(place)
-    # from Python 3.13 on `resolve` does not mind a loop of links; other faults show when it is
-    # opened
-    except OSError as error:
-        inside = inside and error.errno != errno.ELOOP
-    except (RuntimeError, ValueError):  # a loop of links, a zero byte
-        pass
-    if not inside:
-        leads = f"{str(path)!r}, which leads out of {Path(folder).absolute()}"
-        raise InputError(f"{where}: got {leads}, expected a path that stays inside")
-    return place
-
-
-def _mistake(details: Any) -> str:
-    """Say one of pydantic's errors as `section.key: got X, expected Y`."""
-    location, kind, message = details["loc"], details["type"], details["msg"]
-    where = ".".join(map(str, location))
-    if kind == "json_invalid":
-        return _TOO_DEEP
-    if kind == "missing":
-        return f"{where}: missing, expected a value"
-    if kind == "extra_forbidden":
-        known = _known_keys(location[:-1])
-        near = difflib.get_close_matches(str(location[-1]), known, n=1)
-        advice = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
-        return f"{where}: unknown key, {advice}"
-    if kind == "value_error":
-        return f"{where}: {details['ctx']['error']}"
-    expected = re.sub(r"^\w+ should (be )?", "", message).replace("an object", "a table")
-    expected = re.sub(r"^(greater|less)", r"a number \1", re.sub(r"^have ", "one with ", expected))
-    return f"{where}: got {reprlib.repr(details['input'])}, expected {expected}"
-
-
-def _known_keys(location: tuple[str | int, ...]) -> list[str]:
-    """List the keys of the section at a location in the run file."""
-    section: type[BaseModel] = RunSettings
-    for key in location:
-        annotation = section.model_fields[str(key)].annotation
-        section = next(
-            candidate
-            for candidate in (annotation, *get_args(annotation))
-            if inspect.isclass(candidate) and issubclass(candidate, BaseModel)
-        )
-    return list(section.model_fields)

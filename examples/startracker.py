@@ -16,6 +16,7 @@ import numpy as np
 
 import bayesfred as bf
 from bayesfred import settings
+from bayesfred.io.paths import resolve
 
 HERE = Path(__file__).parent
 RUNS = ("startracker.toml", "startracker_alt40_azi135.toml")
@@ -85,7 +86,7 @@ def star_scatter(run_file: Path, chain: bf.Chain) -> tuple[float, float, float, 
     the centroids' errors.
     """
     run = settings.read_settings(run_file)
-    catalogue = settings.resolve(run.catalogue.path, run_file, must_exist=True)
+    catalogue = resolve(run.catalogue.path, run_file, must_exist=True)
     stars = read(catalogue, "hip", "x", "y")
     centroids = read(
         catalogue.with_name(catalogue.stem + "_centroids.csv"), "hip", "u", "v", "err_u", "err_v"

@@ -1,4 +1,4 @@
-"""Whatever is put before `bayesfred fit`: a result, or one clean line; never a traceback, a warning or a lost file.
+"""Any input of `bayesfred fit` gives a result or one line: no traceback, warning or lost file.
 
 Hypothesis makes folders of a run file, a catalogue and a frame: a small problem that can be fitted,
 spoilt in some places. Runs that are sound but long, by their own settings, are left out. The
@@ -360,7 +360,7 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 
 def is_short(run_file: Path) -> bool:
-    """Whether a fit of this run file, if it is sound, takes a second or so, and nothing to compile that other tests do not."""
+    """Whether a fit of this run file takes a second or so, with nothing new to compile."""
     try:
         run = read_settings(run_file)
     except InputError:
@@ -374,7 +374,7 @@ def is_short(run_file: Path) -> bool:
 
 
 def check(files: Files, drawn: bool) -> None:
-    """Fit a folder of these files, beside a folder that is nobody's business; pictures, most of the time, are drawn or not."""
+    """Fit a folder of these files, beside a folder that must stay as it is; render or not."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name).resolve()
         precious, here = root / "precious", root / "here"

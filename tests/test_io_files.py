@@ -16,13 +16,8 @@ from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
 from bayesfred.errors import InputError
-from bayesfred.io.files import (
-    CatalogueRecord,
-    read_catalogue,
-    read_frame,
-    write_catalogue,
-    write_frame,
-)
+from bayesfred.io.catalogues import CatalogueRecord, read_catalogue, write_catalogue
+from bayesfred.io.frames import read_frame, write_frame
 
 COUNTS = np.arange(35.0).reshape(5, 7)
 FRAME_SUFFIXES = [".fits", ".fit", ".FTS", ".fits.gz", ".fits.fz", ".h5", ".hdf5", ".npy"]
@@ -260,7 +255,7 @@ def test_frames_larger_than_memory_are_refused_unread(tmp_path: Path, suffix: st
 def test_memory_is_asked_before_data_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a machine that has room for the bytes of a frame but not for its fit, every format is refused."""
+    """A machine may have room for the bytes of a frame but not for its fit."""
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 10, "SC_PAGE_SIZE": 100}.__getitem__)
     for suffix in FRAME_SUFFIXES:
         write_frame(tmp_path / f"frame{suffix}", COUNTS)
@@ -371,7 +366,9 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
     write_frame(tmp_path / "frame.fits", COUNTS)
     write_catalogue(tmp_path / "stars.csv", stars)
     before = (tmp_path / "frame.fits").read_bytes()
-    assert "frame.fits: exists already" in message(write_frame, tmp_path / "frame.fits", COUNTS + 1)
+    assert "frame.fits: exists, expected a new file" in message(
+        write_frame, tmp_path / "frame.fits", COUNTS + 1
+    )
     assert "--overwrite" in message(write_catalogue, tmp_path / "stars.csv", stars)
     assert (tmp_path / "frame.fits").read_bytes() == before
     write_frame(tmp_path / "frame.fits", COUNTS + 1, overwrite=True)
@@ -384,7 +381,7 @@ def test_links_are_replaced_and_not_followed(tmp_path: Path) -> None:
     for target in ("precious", "absent"):
         link = tmp_path / f"{target}.npy"
         link.symlink_to(target)
-        assert "exists already" in message(write_frame, link, COUNTS)
+        assert "exists, expected a new file" in message(write_frame, link, COUNTS)
         write_frame(link, COUNTS, overwrite=True)
         assert not link.is_symlink()
     assert (tmp_path / "precious").read_text() == "precious"

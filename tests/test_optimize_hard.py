@@ -30,7 +30,7 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling import ensembles
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.ensembles import adapted
 from bayesfred.sampling.moves import LaplaceMove

@@ -2,6 +2,8 @@
 
 import io
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.io.serialize import read, serializable, write
 from bayesfred.model import priors
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.model.parameters import Nuisances, parameter_table
@@ -88,14 +91,20 @@ def test_log_density_is_that_of_scipy_inside_and_outside_the_support() -> None:
         np.testing.assert_allclose(density(vectors) - rest, expected, rtol=1e-12, atol=1e-12)
 
 
+@serializable("test.priors")
+@dataclass(frozen=True)
+class Priors:
+    prior: Mapping[str, Any]
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_priors_survive_the_file(family: str) -> None:
     with h5py.File(io.BytesIO(), "w") as file:
-        priors.write({"background": FAMILIES[family]}, file)
-        (name, p), *rest = priors.read(file).items()
-        file["background"].attrs["family"] = np.bytes_("zipf")
+        write(file, Priors({"background": FAMILIES[family]}))
+        (name, p), *rest = read(file, Priors).prior.items()
+        file["prior/background"].attrs["family"] = np.bytes_("zipf")
         with pytest.raises(InputError, match="zipf"):
-            priors.read(file)
+            read(file, Priors)
     x = FAMILIES[family].ppf(np.linspace(0.01, 0.99, 9))
     assert name == "background" and not rest
     assert np.array_equal(p.logpdf(x), FAMILIES[family].logpdf(x))
@@ -224,8 +233,8 @@ def test_map_is_found_from_afar_and_reports_itself() -> None:
             and np.abs((again.params - best.params) / error).max() < 2e-3
         )
     with h5py.File(io.BytesIO(), "w") as file:
-        best.write(file)
-        copy = MapEstimate.read(file)
+        write(file, best)
+        copy = read(file, MapEstimate)
     assert np.array_equal(copy.params, best.params) and np.array_equal(
         copy.covariance, best.covariance
     )
@@ -346,7 +355,7 @@ def test_a_frame_without_background_is_fitted_and_sampled(tmp_path: Path) -> Non
     best = find_map(posterior)
     assert best.at_maximum and best.params[2] < 1e-4
     chain = sample(posterior, best, path=tmp_path / "chain.h5", seed=1, progress=False)
-    assert diagnose(chain).converged
+    assert diagnose(chain).sampled_well
     # the marginal likelihood of the background, the distortion being known well
     level = np.linspace(0.0, 0.2, 2001)[1:]
     density = posterior.log_prob(

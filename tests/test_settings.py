@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -12,7 +13,11 @@ from pydantic import BaseModel, ValidationError
 
 from bayesfred import settings
 from bayesfred.errors import InputError
-from bayesfred.settings import PriorSettings, RunSettings, read_settings, resolve, within
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.io.paths import resolve, within
+from bayesfred.io.serialize import kinds, serializable
+from bayesfred.sections import model_of
+from bayesfred.settings import PriorSettings, RunSettings, read_settings
 
 EXAMPLE = Path(settings.__file__).with_name("example.toml").read_text(encoding="utf-8")
 
@@ -25,7 +30,7 @@ SECTIONS = {
 
 
 def read(folder: Path, text: str = "", **sections: str) -> RunSettings:
-    """Read a run file that has the sections every one needs, those given in their place, and more text."""
+    """Read a run file of the sections every one needs, or those given, and more text."""
     body = "\n".join(f"[{name}]\n{keys}" for name, keys in {**SECTIONS, **sections}.items())
     path = folder / "run.toml"
     path.write_text(f"{body}\n{text}\n", encoding="utf-8")
@@ -91,14 +96,24 @@ def test_example_names_every_key(tmp_path: Path) -> None:
     table = tomllib.loads(text)
     assert set(table) == set(RunSettings.model_fields)
     for name, field in RunSettings.model_fields.items():
-        section = next(
-            kind for kind in (field.annotation, *get_args(field.annotation)) if is_section(kind)
-        )
-        assert name == "prior" or set(table[name]) == set(section.model_fields)
+        if name in ("psf", "noise"):  # the keys of every kind
+            package = [k for k, c in kinds(name).items() if c.__module__.startswith("bayesfred.")]
+            models = [model_of(name, {"kind": kind}) for kind in package]
+            keys = {key for model in models for key in model.model_fields}
+        elif name in ("detector", "nuisances"):
+            keys = set(model_of(name, {}).model_fields)
+        else:
+            arms = (field.annotation, *get_args(field.annotation))
+            keys = set(next(kind for kind in arms if is_section(kind)).model_fields)
+        assert name == "prior" or set(table[name]) == keys
     # All of them at once, but for the keys that exclude others, are a run file.
     path = tmp_path / "run.toml"
     path.write_text(
-        re.sub(r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling) = |path = \"psf)", "# ", text)
+        re.sub(
+            r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling|variance) = |path = \"psf)",
+            "# ",
+            text,
+        )
     )
     settings = read_settings(path)
     assert settings.prior["f_ux"].keywords == {"loc": 0.0, "scale": 1e-5}
@@ -118,6 +133,47 @@ def test_everything_is_kept_as_json(tmp_path: Path) -> None:
     again = RunSettings.model_validate_json(settings.model_dump_json())
     assert again == settings
     assert again.model_dump_json() == settings.model_dump_json()
+
+
+@serializable("psf.outside")
+@dataclass(frozen=True)
+class OutsidePSF:
+    """A family that the package knows nothing of."""
+
+    width: float
+    turned: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.width > 0:
+            raise InputError(f"psf: width: got {self.width}, expected more")
+
+
+def test_a_family_from_outside_is_named_by_its_kind(tmp_path: Path) -> None:
+    settings = read(tmp_path, psf='kind = "outside"\nwidth = 3')
+    assert settings.psf.make() == OutsidePSF(3.0)
+    again = RunSettings.model_validate_json(settings.model_dump_json())
+    assert again == settings and again.psf.make() == OutsidePSF(3.0)
+    for keys, expected in (
+        ("", "psf.width: missing"),
+        ("width = 0", "psf.width: got 0.0, expected more"),
+        ("width = 1\nturned = 1", "psf.turned: got 1, expected a valid boolean"),
+        ("width = 1\nsigma = 1", "psf.sigma: unknown key with kind = 'outside', expected one of"),
+    ):
+        assert expected in message(tmp_path, psf=f'kind = "outside"\n{keys}')
+
+
+def test_bases_by_name(tmp_path: Path) -> None:
+    for terms, n_terms in (("mirrored", 12), ("pinhole", 8), ("radial_tangential", 5)):
+        d = read(tmp_path, distortion=f'terms = "{terms}"').distortion
+        assert d.make(100.0).n_terms == n_terms
+        assert "expected it with terms = 'polynomial'" in message(
+            tmp_path, distortion=f'terms = "{terms}"\ndegree = 2'
+        )
+    for terms, n_terms in (("polynomial", 18), ("full_polynomial", 46), ("zernike", 18)):
+        d = read(tmp_path, distortion=f'terms = "{terms}"\ndegree = 3').distortion
+        assert d.make(100.0).n_terms == n_terms
+        assert "distortion: got no degree" in message(tmp_path, distortion=f'terms = "{terms}"')
+    assert d.make(100.0) == PolynomialDistortion.zernike(3, radius=100.0)
 
 
 def test_settings_are_frozen(tmp_path: Path) -> None:
@@ -155,32 +211,51 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "psf",
             "sigma = 2\nqqq = 1",
-            "psf.qqq: unknown key, expected one of kind, sigma, fwhm, beta, path, oversampling",
+            "psf.qqq: unknown key with kind = 'gaussian', expected one of kind, sigma",
         ),
-        ("psf", "sigma = -1.5", "psf.sigma: got -1.5, expected a number greater than 0"),
-        ("psf", "", "psf: got no width, expected sigma with kind = 'gaussian'"),
-        ("psf", "fwhm = 2", "psf: got fwhm, expected sigma with kind = 'gaussian'"),
+        ("psf", "sigma = -1.5", "psf.sigma: got -1.5, expected a positive width in pixels"),
+        ("psf", "", "psf.sigma: missing, expected a value"),
+        (
+            "psf",
+            "fwhm = 2",
+            "psf.sigma: missing, expected a value; psf.fwhm: unknown key with kind = "
+            "'gaussian', expected one of kind, sigma",
+        ),
         (
             "psf",
             'kind = "moffat"\nfwhm = 2',
-            "psf: got fwhm, expected fwhm and beta with kind = 'moffat'",
+            "psf.beta: missing, expected a value",
         ),
         (
             "psf",
             'kind = "moffat"\nfwhm = 2\nbeta = 1',
-            "psf.beta: got 1, expected a number greater than 1",
+            "psf.beta: got 1.0, expected 1 < beta <= 100: use a Gaussian in place of larger ones",
         ),
         (
             "psf",
             'kind = "sampled"\nsigma = 2',
-            "psf: got sigma, expected path and oversampling with kind = 'sampled'",
+            "psf.path: missing, expected a value; psf.oversampling: missing, expected a value; "
+            "psf.sigma: unknown key with kind = 'sampled', expected one of kind, path, "
+            "oversampling",
         ),
         (
             "psf",
             'kind = "sampled"\npath = "p.npy"\noversampling = 0.5',
-            "psf.oversampling: got 0.5, expected a number greater than or",
+            "psf.oversampling: got 0.5, expected samples per pixel, 1 to 1001",
         ),
-        ("psf", 'kind = "airy"', "psf.kind: got 'airy', expected "),
+        (
+            "psf",
+            'kind = "airy"',
+            "psf.kind: got 'airy', expected '",
+        ),
+        ("psf", "kind = 3\nsigma = 1", "psf.kind: got 3, expected '"),
+        ("psf", 'kind = "gaussian"\nsigma = 1e16', "psf.sigma: got 1e+16, expected a number less"),
+        ("psf", 'sigma = "2"', "psf.sigma: got '2', expected a valid number"),
+        (
+            "psf",
+            "sigmma = 2",
+            "psf.sigmma: unknown key with kind = 'gaussian', did you mean 'sigma'?",
+        ),
         (
             "catalogue",
             'path = "a"\nmagnitude = "m"',
@@ -190,12 +265,12 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "detector",
             'pixel = "square"',
-            "detector.pixel: got 'square', expected 'impulse' or 'box'",
+            "detector.pixel: got 'square', expected one of 'impulse', 'box'",
         ),
         (
             "detector",
             "binning = 0",
-            "detector.binning: got 0, expected a number greater than or equal to 1",
+            "detector.binning: got 0, expected an integer of 1 to 1000",
         ),
         ("detector", "binning = 1.5", "detector.binning: got 1.5, expected a valid integer"),
         (
@@ -214,7 +289,7 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "distortion",
             'terms = "full_polynomial"\ndegree = 1',
-            "distortion.degree: got 1, expected a number greater",
+            "distortion.degree: got 1, expected an integer of at least 2",
         ),
         ("distortion", 'terms = "paper"\ndegree = 3', "distortion: got degree 3"),
         (
@@ -244,13 +319,17 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
             "model.tolerance: got -1e-09, expected a number greater than or",
         ),
         ("model", "conserve_flux = 1", "model.conserve_flux: got 1, expected a valid boolean"),
-        ("noise", 'kind = "gauss"', "noise.kind: got 'gauss', expected 'poisson' or 'background'"),
+        ("noise", 'kind = "gauss"', "noise.kind: got 'gauss', expected 'background'"),
         (
             "noise",
             "read_noise = -1",
-            "noise.read_noise: got -1, expected a number greater than or equal",
+            "noise.read_noise: got -1.0, expected a standard deviation >= 0 in counts",
         ),
-        ("noise", 'kind = "background"\nread_noise = 2.0', "noise: got read_noise 2.0"),
+        (
+            "noise",
+            'kind = "background"\nread_noise = 2.0',
+            "noise.read_noise: unknown key with kind = 'background', expected one of kind",
+        ),
         (
             "nuisances",
             'flux = "none"',
@@ -264,8 +343,10 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "nuisances",
             "footprint = 0.0",
-            "nuisances.footprint: got 0.0, expected a number greater than 0",
+            "nuisances.footprint: got 0.0, expected a radius in pixels > 0",
         ),
+        ("nuisances", "position_scatter = true", "nuisances.position_scatter: got it with fixed"),
+        ("nuisances", "ofset = true", "nuisances.ofset: unknown key, did you mean 'offset'?"),
         ("nuisances", 'offset = "yes"', "nuisances.offset: got 'yes', expected a valid boolean"),
         ("prior", "f_ux = 3", "prior.f_ux: got 3, expected a table"),
         ("prior.f_ux", "scale = 1", "prior.f_ux.distribution: missing, expected a value"),
@@ -331,7 +412,7 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "detector",
             "binning = 1001",
-            "detector.binning: got 1001, expected a number less than or equal to 1000",
+            "detector.binning: got 1001, expected an integer of 1 to 1000",
         ),
         (
             "distortion",
@@ -376,9 +457,8 @@ def test_a_missing_section_and_several_mistakes(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_settings(path)
     assert str(caught.value).startswith(
-        f"{path}: frame: got 3, expected a table; psf.sigma: got 0, expected a number greater "
-        "than 0; "
-        "x y: unknown key, expected one of frame"
+        f"{path}: frame: got 3, expected a table; psf.sigma: got 0.0, expected a positive width in "
+        "pixels; x y: unknown key, expected one of frame"
     )
 
 
@@ -445,7 +525,7 @@ def test_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "sub/../a.h5",
         "inner/a.h5",
         f"{folder}/a.h5",
-        "outer/runs/a.h5",
+        "outer/commands/a.h5",
     ):
         assert within(folder, path, "where") == folder / path
     for path in (
@@ -460,7 +540,7 @@ def test_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         with pytest.raises(
             InputError,
-            match=r"^where: got .*, which leads out of .*runs, expected a path that stays inside$",
+            match=r"^where: got .*, which leads out of .*commands, expected a path that stays ins",
         ):
             within(folder, path, "where")
     monkeypatch.chdir(folder)

@@ -36,8 +36,9 @@ from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError, printable
-from bayesfred.io import files
+from bayesfred.io import tables
 from bayesfred.io.lock import only_writer
+from bayesfred.io.paths import may_write
 from bayesfred.model.threads import one_thread
 from bayesfred.sampling.sampler import versions
 
@@ -109,7 +110,7 @@ def run(
     resume: bool,
     overwrite: bool,
     progress: bool,
-) -> files.TableRecord:
+) -> tables.TableRecord:
     """Do tasks 0 to n - 1 of a study, but those that the table holds already.
 
     Parameters
@@ -126,7 +127,7 @@ def run(
     workers : int, optional
         Processes of that pool, by default one a core; 1 is this process alone.
     resume, overwrite : bool
-        Go on with the study in the file; replace it.
+        Resume the study in the file; replace it.
     progress : bool
         Show a progress bar with the time that is left on standard error.
 
@@ -149,25 +150,22 @@ def run(
     contents = study.contents()
     key = hashlib.sha256(json.dumps(contents).encode()).hexdigest()
     with only_writer(path):
-        if path.exists() and not (resume or overwrite):
-            remedy = "go on with the study in it (resume), or replace it (overwrite)"
-            raise InputError(f"{path}: exists, expected a new file: {remedy}")
-        if not (resume and path.exists()):
+        if not may_write(path, resume=resume, overwrite=overwrite):
             empty = {
                 "task": np.empty(0, np.int64),
                 **dict.fromkeys(study.columns, np.empty(0)),
                 "message": np.empty(0, "U1"),
             }
             everything = {**meta, "versions": versions(), "contents": contents}
-            files.write_table(path, files.TableRecord(empty, everything), overwrite=overwrite)
-        record = files.read_table(path)
+            tables.write_table(path, tables.TableRecord(empty, everything), overwrite=overwrite)
+        record = tables.read_table(path)
         _check_same(path, record, study, contents)
         done = set(record.columns["task"].tolist())
         todo = deque(k for k in range(n) if k not in done)
         blank = [float("nan")] * len(study.columns)
         if todo:
             with ExitStack() as stack:
-                append = stack.enter_context(files.appending(path))
+                append = stack.enter_context(tables.appending(path))
                 update = stack.enter_context(_progress(n, n - len(todo), progress))
                 for k, given in _answers(
                     study, key, todo, stack.enter_context(_executor(executor, workers))
@@ -180,10 +178,10 @@ def run(
                         ]
                     )
                     update(given.numbers is None)
-            record = files.read_table(path)
+            record = tables.read_table(path)
     order = np.argsort(record.columns["task"], kind="stable")
     order = order[record.columns["task"][order] < n]
-    return files.TableRecord(
+    return tables.TableRecord(
         {name: values[order] for name, values in record.columns.items()}, record.meta
     )
 
@@ -219,7 +217,7 @@ def _answers(
                 raise InputError(
                     f"study: the workers failed ({type(error).__name__}: {error}), expected them "
                     "to live; what is finished is "
-                    "kept: resume, with fewer workers if it was for want of memory"
+                    "kept: resume, with fewer workers if it was because of insufficient memory"
                 ) from error
             if given.message is None:
                 send(k, True)
@@ -324,7 +322,7 @@ def _progress(total: int, completed: int, show: bool) -> Iterator[Callable[[bool
 
 
 def _check_same(
-    path: Path, record: files.TableRecord, study: Study, contents: Mapping[str, str]
+    path: Path, record: tables.TableRecord, study: Study, contents: Mapping[str, str]
 ) -> None:
     """Refuse to go on with another study."""
     stored = record.meta.get("contents")

@@ -68,15 +68,13 @@ class _Calibration:
     @cached_property
     def _field(self) -> dict[str, Floats]:
         """f and g at points of the field, as far as they depend on theta: they are linear in it, with these factors."""
-        distortion = self.posterior.model.distortion
+        distortion = self.posterior.model.polynomial
         places = np.rint(
             0.5 * np.array(self.posterior.model.detector.fine_shape[::-1]) * FIELD_POINTS
         )
         field: dict[str, Floats] = {}
         for u, v in places:
-            both = np.array(
-                [distortion.displacement(unit, u, v, u, v) for unit in np.eye(distortion.n_terms)]
-            ).T
+            both = distortion.design_matrix(u, v, u, v)
             field |= {
                 f"{letter}({u:+.0f}, {v:+.0f})": factors
                 for letter, factors in zip("fg", both, strict=True)

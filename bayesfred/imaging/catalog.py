@@ -7,14 +7,16 @@ along columns, y along rows. `forward` turns a catalogue and a distortion into e
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.serialize import serializable
 
 
+@serializable("catalog")
 @dataclass(frozen=True, eq=False)
 class SourceCatalog:
     """Point sources; the arrays are copied, converted to float64 and made read-only.
@@ -97,16 +99,6 @@ class SourceCatalog:
     def __len__(self) -> int:
         """Count the sources."""
         return len(self.x)
-
-    def write(self, group: Any) -> None:
-        """Store the catalogue in an HDF5 group: float64 datasets `x`, `y` and `flux`."""
-        for name in ("x", "y", "flux"):
-            group[name] = getattr(self, name)
-
-    @classmethod
-    def read(cls, group: Any) -> Self:
-        """Rebuild what `write` stored; InputError if the stored columns are not a valid catalogue."""
-        return cls(*(np.asarray(group[name]) for name in ("x", "y", "flux")))
 
 
 def _column(name: str, values: object) -> Floats:

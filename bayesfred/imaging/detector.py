@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import operator
 from dataclasses import dataclass
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +21,7 @@ from scipy.special import sici
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.serialize import serializable
 
 PIXELS = ("impulse", "box")
 
@@ -33,6 +33,7 @@ BOX_TOLERANCE = 2e-8
 MOST_POINTS = 1000
 
 
+@serializable("detector")
 @dataclass(frozen=True)
 class Detector:
     """Geometry and pixel response of a frame.
@@ -49,8 +50,8 @@ class Detector:
     Raises
     ------
     InputError
-        If `shape` is not two integers >= 1, `binning` is not an integer >= 1, or `pixel` is not one
-        of the two.
+        If `shape` is not two integers >= 1, `binning` is not an integer from 1 to `MOST_POINTS`, or
+        `pixel` is not one of the two.
 
     References
     ----------
@@ -73,8 +74,10 @@ class Detector:
             raise InputError(f"shape: got {self.shape!r}, expected two integers (ny, nx)") from None
         if min(ny, nx) < 1:
             raise InputError(f"shape: got {(ny, nx)}, expected (ny, nx) of at least 1 pixel each")
-        if not isinstance(self.binning, int | np.integer) or self.binning < 1:
-            raise InputError(f"binning: got {self.binning!r}, expected an integer of at least 1")
+        if not isinstance(self.binning, int | np.integer) or not 1 <= self.binning <= MOST_POINTS:
+            raise InputError(
+                f"binning: got {self.binning!r}, expected an integer of 1 to {MOST_POINTS}"
+            )
         if self.pixel not in PIXELS:
             raise InputError(
                 f"pixel: got {self.pixel!r}, expected one of {', '.join(map(repr, PIXELS))}"
@@ -144,18 +147,6 @@ class Detector:
         return np.asarray(nodes * half, dtype=np.float64), np.asarray(
             weights * half, dtype=np.float64
         )
-
-    def write(self, group: Any) -> None:
-        """Store the detector in an HDF5 group: attributes `shape`, `binning` and `pixel`."""
-        group.attrs["shape"] = np.array(self.shape, dtype=np.int64)
-        group.attrs["binning"] = self.binning
-        group.attrs["pixel"] = np.bytes_(self.pixel)
-
-    @classmethod
-    def read(cls, group: Any) -> Self:
-        """Rebuild what `write` stored; InputError if the stored values are not valid."""
-        ny, nx = (int(side) for side in group.attrs["shape"])
-        return cls((ny, nx), int(group.attrs["binning"]), bytes(group.attrs["pixel"]).decode())
 
 
 def _centred(n: int) -> Floats:

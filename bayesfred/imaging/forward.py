@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,18 +20,19 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
-from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.distortion import Distortion, PolynomialDistortion
 from bayesfred.imaging.kernels.geometry import Optics, stride
 from bayesfred.imaging.kernels.jacobian import Basis, jacobian
 from bayesfred.imaging.kernels.render import image
-from bayesfred.imaging.logarithm import LogDistortion
-from bayesfred.imaging.psf import FWHM, PSF, read_psf
+from bayesfred.imaging.psf import FWHM, PSF
+from bayesfred.io.serialize import serializable
 
 # An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2):
 # 1 % at this width.
 NARROWEST_IMPULSE = math.sqrt(math.log(400.0) / (2.0 * math.pi**2))
 
 
+@serializable("model")
 @dataclass(frozen=True)
 class ForwardModel:
     """Expected counts of a distorted field of point sources.
@@ -45,9 +45,9 @@ class ForwardModel:
         Positions (pixel) and fluxes (counts) in the object plane.
     psf : GaussianPSF, MoffatPSF or SampledPSF
         Reference PSF at the axis.
-    distortion : PolynomialDistortion or LogDistortion
-        The terms of f and g. What is not polynomial can be simulated, not fitted: it has expected
-        counts alone.
+    distortion : Distortion
+        The displacements f and g. One that is not a `PolynomialDistortion` can be simulated, not
+        fitted: it has expected counts alone.
     conserve_flux : bool
         Whether the kernel carries |D|. False is the kernel as the paper prints it.
     tolerance : float
@@ -77,7 +77,7 @@ class ForwardModel:
     detector: Detector
     sources: SourceCatalog
     psf: PSF
-    distortion: PolynomialDistortion | LogDistortion
+    distortion: Distortion
     conserve_flux: bool = field(default=True, kw_only=True)
     tolerance: float = field(default=1e-8, kw_only=True)
 
@@ -93,15 +93,20 @@ class ForwardModel:
                 "sub-pixel position; use pixel = 'box'"
             )
 
+    @property
+    def polynomial(self) -> PolynomialDistortion:
+        """The distortion, if it is one that can be fitted; an InputError otherwise."""
+        if not isinstance(self.distortion, PolynomialDistortion):
+            raise InputError(
+                f"distortion: got {type(self.distortion).__name__}, expected "
+                "PolynomialDistortion: no other can be fitted"
+            )
+        return self.distortion
+
     def optics(self, narrowest: float | None = None) -> Optics:
         """The model as the compiled loops need it, with pixels integrated well for PSFs of widths down to `narrowest` (pixel)."""
-        if isinstance(self.distortion, LogDistortion):
-            raise InputError(
-                "distortion: got LogDistortion, expected PolynomialDistortion: what is not "
-                "polynomial is not fitted"
-            )
-        f = np.array(self.distortion.f_terms, dtype=np.int64).reshape(-1, 4)
-        g = np.array(self.distortion.g_terms, dtype=np.int64).reshape(-1, 4)
+        f = np.array(self.polynomial.f_terms, dtype=np.int64).reshape(-1, 4)
+        g = np.array(self.polynomial.g_terms, dtype=np.int64).reshape(-1, 4)
         degree = max(1, int(np.concatenate([f, g])[:, 2:].max()))
         x, y = self.sources.x[:, None], self.sources.y[:, None]
         ny, nx = self.detector.shape
@@ -134,8 +139,8 @@ class ForwardModel:
         return self.optics()
 
     def basis(self, nuisances: Sequence[str] = ()) -> Basis:
-        """What the derivatives are made of: those with respect to theta, then to the named nuisances."""
-        d, ones = self.distortion, np.ones((len(self.sources), 1))
+        """What the derivatives consist of: with respect to the monomials, then to the nuisances."""
+        d, ones = self.polynomial, np.ones((len(self.sources), 1))
         constant = [(0, 0)] if "offset_x" in nuisances else []
         f = list(dict.fromkeys([t[2:] for t in d.f_terms] + constant))
         g = list(dict.fromkeys([t[2:] for t in d.g_terms] + constant))
@@ -175,10 +180,18 @@ class ForwardModel:
             If `theta` has another shape.
         """
         ny, nx = self.detector.shape
-        if isinstance(self.distortion, LogDistortion):
+        if not isinstance(self.distortion, PolynomialDistortion):
             return self._every_pixel() + background
         out = np.full(ny * stride(nx), float(background))
-        image(self._optics, self._check(theta), 0.0, 0.0, self.psf.sigma, self.sources.flux, out)
+        image(
+            self._optics,
+            self._monomial_coefficients(theta),
+            0.0,
+            0.0,
+            self.psf.sigma,
+            self.sources.flux,
+            out,
+        )
         return out.reshape(ny, -1)[:, :nx]
 
     def _every_pixel(self) -> Floats:
@@ -211,36 +224,13 @@ class ForwardModel:
         ndarray, shape (n_terms, ny, nx), counts per pixel per unit of the coefficient
         """
         ny, nx = self.detector.shape
-        out = np.zeros((self.distortion.n_terms, ny, stride(nx)))
-        jacobian(
-            self._optics, self._check(theta), self.psf.sigma, self.sources.flux, self.basis(), out
-        )
-        return out[:, :, :nx]
+        coefficients = self._monomial_coefficients(theta)
+        out = np.zeros((coefficients.size, ny, stride(nx)))
+        jacobian(self._optics, coefficients, self.psf.sigma, self.sources.flux, self.basis(), out)
+        return self.polynomial.pull_back(out[:, :, :nx])
 
-    def _check(self, theta: npt.ArrayLike) -> Floats:
-        values = np.ascontiguousarray(theta, dtype=np.float64)
-        if values.shape != (self.distortion.n_terms,):
-            raise InputError(
-                f"theta: got shape {values.shape}, expected ({self.distortion.n_terms},): "
-                + ", ".join(self.distortion.names)
-            )
-        return values
-
-    def write(self, group: Any) -> None:
-        """Store the model in an HDF5 group."""
-        group.attrs["conserve_flux"] = self.conserve_flux
-        group.attrs["tolerance"] = self.tolerance
-        for name in ("detector", "sources", "psf", "distortion"):
-            getattr(self, name).write(group.create_group(name))
-
-    @classmethod
-    def read(cls, group: Any) -> "ForwardModel":
-        """The model stored in an HDF5 group by `write`."""
-        return cls(
-            Detector.read(group["detector"]),
-            SourceCatalog.read(group["sources"]),
-            read_psf(group["psf"]),
-            PolynomialDistortion.read(group["distortion"]),
-            conserve_flux=bool(group.attrs["conserve_flux"]),
-            tolerance=float(group.attrs["tolerance"]),
-        )
+    def _monomial_coefficients(self, theta: npt.ArrayLike) -> Floats:
+        coefficients = self.polynomial.monomial_coefficients(theta)
+        if coefficients.ndim != 1:
+            raise InputError(f"theta: got shape {np.shape(theta)}, expected one dimension")
+        return np.ascontiguousarray(coefficients)

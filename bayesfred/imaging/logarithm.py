@@ -1,4 +1,7 @@
-"""A distortion that is not polynomial, the paper's logarithm: to simulate frames that polynomials are then fitted to."""
+"""A distortion that is not polynomial, the paper's logarithm.
+
+Frames are simulated with it, and polynomials fitted to them.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,15 @@ from scipy import optimize
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.serialize import serializable
 
 
+@serializable("distortion.logarithm")
 @dataclass(frozen=True)
 class LogDistortion:
-    """f = x log(1 + c (u^2 + v^2)), g = y log(1 + c (u^2 + v^2)): barrel-shaped, without coefficients to fit.
+    """f = x log(1 + c (u^2 + v^2)), g = y log(1 + c (u^2 + v^2)): barrel-shaped.
 
-    The methods take theta like those of `PolynomialDistortion`; there is none, so that it is empty.
+    There are no coefficients to fit: the methods' argument theta, see `Distortion`, is empty.
 
     Attributes
     ----------
@@ -43,8 +48,6 @@ class LogDistortion:
     c: float
     n_terms: ClassVar[int] = 0
     names: ClassVar[tuple[str, ...]] = ()
-    f_terms: ClassVar[tuple[tuple[int, int, int, int], ...]] = ()
-    g_terms: ClassVar[tuple[tuple[int, int, int, int], ...]] = ()
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.c) and self.c >= 0.0):
@@ -53,7 +56,7 @@ class LogDistortion:
     def displacement(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
     ) -> tuple[Floats, Floats]:
-        """Evaluate f and g, pixel; the arguments are those of `PolynomialDistortion.displacement`."""
+        """Evaluate f and g, pixel; see `PolynomialDistortion.displacement`."""
         u, v, x, y = (np.asarray(value, dtype=np.float64) for value in (u, v, x, y))
         logarithm = np.log1p(self.c * (u**2 + v**2))
         return x * logarithm, y * logarithm
@@ -61,12 +64,15 @@ class LogDistortion:
     def determinant(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
     ) -> Floats:
-        """Jacobian determinant D = (1 + f_u)(1 + g_v) - f_v g_u, in which f_u g_v and f_v g_u cancel."""
+        """Jacobian determinant D = (1 + f_u)(1 + g_v) - f_v g_u; f_u g_v and f_v g_u cancel."""
         u, v, x, y = (np.asarray(value, dtype=np.float64) for value in (u, v, x, y))
         return np.asarray(1.0 + 2.0 * self.c * (x * u + y * v) / (1.0 + self.c * (u**2 + v**2)))
 
     def image_position(self, theta: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
-        """Where the image of an object point stands: on the same radius, at rho = r (1 - log(1 + c rho^2)) from the axis."""
+        """Where the image of an object point stands, pixel.
+
+        It is on the same radius, at the distance rho = r (1 - log(1 + c rho^2)) from the axis.
+        """
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         r = np.hypot(x, y)
         rho = optimize.newton(

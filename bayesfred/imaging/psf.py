@@ -13,7 +13,7 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from scipy import linalg, ndimage, special
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.kernels.psf_profiles import Gaussian, Moffat, Spline
+from bayesfred.io.serialize import serializable
 
 FWHM = math.sqrt(8.0 * math.log(2.0))  # of a Gaussian of unit width
 LARGEST_BETA = 100.0  # beyond, (1 + x)^-beta loses digits, and is a Gaussian to 1 %
@@ -29,6 +30,7 @@ MOST_SAMPLES = 1001  # of a sampled PSF, a side
 MARGIN = 4  # zeros around a spline's coefficients
 
 
+@serializable("psf.gaussian")
 @dataclass(frozen=True)
 class GaussianPSF:
     """Circular Gaussian, p(a, b) = exp(-(a^2 + b^2) / 2 sigma^2) / (2 pi sigma^2).
@@ -83,16 +85,8 @@ class GaussianPSF:
         """The PSF at (a, b), pixel from its middle; per square pixel."""
         return np.asarray(self.peak * np.exp(-0.5 * (np.square(a) + np.square(b)) / self.sigma**2))
 
-    def write(self, group: Any) -> None:
-        """Store the PSF in an HDF5 group."""
-        group.attrs["sigma"] = self.sigma
 
-    @classmethod
-    def read(cls, group: Any) -> Self:
-        """The PSF stored in an HDF5 group by `write`."""
-        return cls(float(group.attrs["sigma"]))
-
-
+@serializable("psf.moffat")
 @dataclass(frozen=True)
 class MoffatPSF:
     """Circular Moffat function, p(a, b) = (beta - 1) / (pi alpha^2) (1 + (a^2 + b^2) / alpha^2)^-beta.
@@ -180,17 +174,8 @@ class MoffatPSF:
             self.peak * (1.0 + (np.square(a) + np.square(b)) / self.alpha**2) ** -self.beta
         )
 
-    def write(self, group: Any) -> None:
-        """Store the PSF in an HDF5 group."""
-        group.attrs["fwhm"] = self.fwhm
-        group.attrs["beta"] = self.beta
 
-    @classmethod
-    def read(cls, group: Any) -> Self:
-        """The PSF stored in an HDF5 group by `write`."""
-        return cls(float(group.attrs["fwhm"]), float(group.attrs["beta"]))
-
-
+@serializable("psf.sampled")
 @dataclass(frozen=True, eq=False)
 class SampledPSF:
     """A PSF of any shape, given by samples: the cubic spline through them, scaled to unit volume.
@@ -406,25 +391,8 @@ class SampledPSF:
         values = ndimage.map_coordinates(self._spline, at.reshape(2, -1), prefilter=False)
         return np.asarray(self.oversampling**2 * values.reshape(at.shape[1:]))
 
-    def write(self, group: Any) -> None:
-        """Store the PSF in an HDF5 group."""
-        group.create_dataset("values", data=self.values, fletcher32=True)
-        group.attrs["oversampling"] = self.oversampling
-
-    @classmethod
-    def read(cls, group: Any) -> Self:
-        """The PSF stored in an HDF5 group by `write`."""
-        return cls(group["values"][()], float(group.attrs["oversampling"]))
-
 
 PSF = GaussianPSF | MoffatPSF | SampledPSF
-
-
-def read_psf(group: Any) -> PSF:
-    """The PSF stored in an HDF5 group."""
-    if "values" in group:
-        return SampledPSF.read(group)
-    return (MoffatPSF if "fwhm" in group.attrs else GaussianPSF).read(group)
 
 
 def _coefficients(values: Floats) -> Floats:

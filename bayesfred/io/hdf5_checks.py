@@ -1,10 +1,10 @@
 """What a chain file must be before anything is read from it.
 
 A chain file ends with its seal, a line with the SHA-256 of everything before it; HDF5 ignores what
-follows its own end. So a bit that flipped, a cut or an edit shows before HDF5 sees the file. But
-whoever makes a file can seal it too, so behind the seal every link, attribute and array is looked
-at, none of them read: they must be plain numbers and texts that lie in the file itself, each once
-and in full.
+follows its own end. So a bit that flipped, a cut or an edit shows before HDF5 sees the file. A file
+made to do harm can be sealed too. So every link, attribute and array is checked next, before any of
+them is read: they must be plain numbers and texts that lie in the file itself, each once and in
+full.
 """
 
 import hashlib
@@ -21,16 +21,16 @@ from h5py import h5a, h5d, h5l, h5o, h5t, h5z
 from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
-SCHEMA = 2
+SCHEMA = 3
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 
-# More than any chain file has, and little enough to look through in an instant.
+# More than any chain file has, and few enough to check in an instant.
 MOST_OBJECTS = 10_000  # attributes among them
 MOST_ATTRIBUTES = 100  # of one object
 LARGEST_ATTRIBUTE = 2**16  # bytes
 
-MEND = "restore a copy, or run again"
+REMEDY = "restore a copy, or run again"
 
 
 def seal(content: memoryview | bytes) -> bytes:
@@ -71,9 +71,8 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
     try:
         with open(path, "rb") as stream:
             size = _check_seal(stream)
-            with h5py.File(
-                stream, "r"
-            ) as file:  # the very file whose seal was checked, whatever is renamed meanwhile
+            # the very file whose seal was checked, even if another is renamed over it meanwhile
+            with h5py.File(stream, "r") as file:
                 _check_attributes("", file.id)
                 _check_schema(file.attrs.get("kind"), file.attrs.get("schema"))
                 _check_tree(file.id, size)
@@ -91,12 +90,12 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
     ) as error:
         reason = " ".join(str(error).split())[:400]
         raise InputError(
-            f"{path}: damaged ({reason}), expected a whole chain file: {MEND}"
+            f"{path}: damaged ({reason}), expected a whole chain file: {REMEDY}"
         ) from None
 
 
 def _check_seal(stream: BinaryIO) -> int:
-    """Size of the file, once its content is what its seal says; the stream is back at its beginning."""
+    """Size of the file, whose content is what its seal says; the stream is back at its start."""
     size = os.fstat(stream.fileno()).st_size
     digest, left = hashlib.sha256(), size - SEAL_SIZE
     while left > 0:
@@ -106,12 +105,12 @@ def _check_seal(stream: BinaryIO) -> int:
     found = stream.read()
     if not found.startswith(SEAL.split("{", maxsplit=1)[0].encode()):
         raise InputError(
-            f"got no seal at the end, expected a whole chain written by `bayesfred fit`: {MEND}"
+            f"got no seal at the end, expected a whole chain written by `bayesfred fit`: {REMEDY}"
         )
     if found != SEAL.format(digest.hexdigest()).encode():
         raise InputError(
             "got another content than its seal says, expected it as it was written: damaged or "
-            f"changed: {MEND}"
+            f"changed: {REMEDY}"
         )
     stream.seek(0)
     return size
@@ -121,12 +120,12 @@ def _check_schema(kind: Any, schema: Any) -> None:
     if kind == KIND and schema == SCHEMA:
         return
     later = bool(kind == KIND and schema > SCHEMA)
-    mend = "read it with the version that wrote it" if later else "remake it with this version"
+    remedy = "read it with the version that wrote it" if later else "remake it with this version"
     got = (
         f"{kind.decode(errors='replace') if isinstance(kind, bytes) else kind!r} of "
         f"{'newer ' * later}schema {schema}"
     )
-    raise InputError(f"got {got}, expected {KIND.decode()} of schema {SCHEMA}: {mend}")
+    raise InputError(f"got {got}, expected {KIND.decode()} of schema {SCHEMA}: {remedy}")
 
 
 def _check_tree(root: Any, size: int) -> None:
@@ -136,30 +135,32 @@ def _check_tree(root: Any, size: int) -> None:
         name, node = todo.pop()
         address = h5o.get_info(node).addr
         if address in seen:
-            raise InputError(f"{name}: got a second link to one object, expected each once: {MEND}")
+            raise InputError(
+                f"{name}: got a second link to one object, expected each once: {REMEDY}"
+            )
         seen.add(address)
         number += 1 + _check_attributes(name, node)
         if isinstance(node, h5d.DatasetID):
             held += _check_dataset(name, node)
             if held > size:
                 raise InputError(
-                    f"{name}: got arrays larger than the file, expected them to lie in it: {MEND}"
+                    f"{name}: got arrays larger than the file, expected them to lie in it: {REMEDY}"
                 )
             continue
         if number + len(todo) + node.get_num_objs() > MOST_OBJECTS:
             raise InputError(
-                f"got more than {MOST_OBJECTS} objects, expected those of a chain: {MEND}"
+                f"got more than {MOST_OBJECTS} objects, expected those of a chain: {REMEDY}"
             )
         for key in node:
             child = f"{name}/{key.decode(errors='replace')}"
             if node.links.get_info(key).type != h5l.TYPE_HARD:
                 raise InputError(
-                    f"{child}: got a soft or external link, expected what it leads to: {MEND}"
+                    f"{child}: got a soft or external link, expected what it leads to: {REMEDY}"
                 )
             item = h5o.open(node, key)
             if not isinstance(item, h5d.DatasetID | h5py.h5g.GroupID):
                 raise InputError(
-                    f"{child}: got neither a group nor an array, expected one of them: {MEND}"
+                    f"{child}: got neither a group nor an array, expected one of them: {REMEDY}"
                 )
             todo.append((child, item))
 
@@ -169,12 +170,12 @@ def _check_attributes(name: str, node: Any) -> int:
     number = int(h5a.get_num_attrs(node))
     if number > MOST_ATTRIBUTES:
         raise InputError(
-            f"{name or '/'}: got {number} attributes, expected at most {MOST_ATTRIBUTES}: {MEND}"
+            f"{name or '/'}: got {number} attributes, expected at most {MOST_ATTRIBUTES}: {REMEDY}"
         )
     for k in range(number):
         item = h5a.open(node, index=k)
         label, kind = f"{name}@{item.name.decode(errors='replace')}", item.get_type()
-        # emcee wants this one as a text without a fixed length; nobody reads it here
+        # emcee wants this one as a text without a fixed length. Nothing here reads it.
         if (
             label.endswith("@random_state_0")
             and item.shape == ()
@@ -182,9 +183,9 @@ def _check_attributes(name: str, node: Any) -> int:
         ):
             continue
         _check_type(label, kind, texts=True)
-        if math.prod(item.shape) * kind.get_size() > LARGEST_ATTRIBUTE:
+        if math.prod(item.shape or ()) * kind.get_size() > LARGEST_ATTRIBUTE:
             raise InputError(
-                f"{label}: got an attribute of shape {item.shape}, expected a small one: {MEND}"
+                f"{label}: got an attribute of shape {item.shape}, expected a small one: {REMEDY}"
             )
     return number
 
@@ -194,28 +195,28 @@ def _check_dataset(name: str, node: Any) -> int:
     plist, kind = node.get_create_plist(), node.get_type()
     _check_type(name, kind, texts=False)
     if plist.get_external_count():
-        raise InputError(f"{name}: got an array in another file, expected it in this one: {MEND}")
+        raise InputError(f"{name}: got an array in another file, expected it in this one: {REMEDY}")
     if plist.get_layout() == h5d.VIRTUAL:
-        raise InputError(f"{name}: got a virtual array, expected its numbers: {MEND}")
+        raise InputError(f"{name}: got a virtual array, expected its numbers: {REMEDY}")
     if {plist.get_filter(k)[0] for k in range(plist.get_nfilters())} - {h5z.FILTER_FLETCHER32}:
-        raise InputError(f"{name}: got a compressed array, expected plain numbers: {MEND}")
+        raise InputError(f"{name}: got a compressed array, expected plain numbers: {REMEDY}")
     stored = int(node.get_storage_size())
     chunk = math.prod(plist.get_chunk()) if plist.get_layout() == h5d.CHUNKED else 0
     if max(math.prod(node.shape), chunk) * kind.get_size() > stored:
         raise InputError(
             f"{name}: got shape {node.shape} and {stored} bytes, expected an array that the file "
-            f"holds: {MEND}"
+            f"holds: {REMEDY}"
         )
     return stored
 
 
 def _check_type(name: str, kind: Any, *, texts: bool) -> None:
-    """Numbers of at most 8 bytes, booleans, which are enumerations, and, where allowed, texts of a fixed length."""
+    """Refuse all types but numbers of at most 8 bytes, booleans (enumerations) and short texts."""
     of, size = kind.get_class(), kind.get_size()
     plain = of in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) and size <= 8
     text = texts and of == h5t.STRING and not kind.is_variable_str()
     if not (plain or text):
         raise InputError(
             f"{name}: got an unknown type of {size} bytes, expected "
-            f"numbers{' or a text' * texts}: {MEND}"
+            f"numbers{' or a text' * texts}: {REMEDY}"
         )

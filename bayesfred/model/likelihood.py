@@ -230,7 +230,7 @@ class FrameLikelihood:
 
     def _arguments(self, vectors: Floats) -> Arguments:
         """Distortion coefficients, source nuisances and background coefficients, a row a vector."""
-        distortion = self.model.distortion
+        distortion = self.model.polynomial
         source = np.tile(self._neutral, (len(vectors), 1))
         background = np.zeros((len(vectors), len(BACKGROUND_TERMS)))
         for k, parameter in enumerate(self.parameters):
@@ -238,7 +238,8 @@ class FrameLikelihood:
                 values = source if parameter.kind == "source" else background
                 values[:, parameter.slot] = vectors[:, k]
         background[:, 0] += self.noise.shift
-        return np.ascontiguousarray(vectors[:, : distortion.n_terms]), source, background
+        theta = distortion.monomial_coefficients(vectors[:, : distortion.n_terms])
+        return np.ascontiguousarray(theta), source, background
 
     def _one(self, params: Floats) -> Arguments:
         """The arguments of one parameter vector."""
@@ -256,13 +257,14 @@ class FrameLikelihood:
         Its rows are the distortion's monomials, the free nuisances of the sources, the scatter and
         the background's terms. The kernels' derivative by flux is relative to the scaled flux.
         """
-        monomials = len(self.model.distortion.names)
-        sources = self._basis.row.size
+        d = self.model.polynomial
+        change = np.eye(d.n_terms) if d.basis is None else d.basis
+        monomials, sources = len(change), self._basis.row.size
         free = [name for name in self.nuisances.source_names if name != "position_scatter"]
         out = np.zeros((sources + 1 + len(BACKGROUND_TERMS), len(self.parameters)))
         for k, parameter in enumerate(self.parameters):
             if parameter.kind == "distortion":
-                out[parameter.slot, k] = 1.0
+                out[:monomials, k] = change[:, parameter.slot]
             elif parameter.kind == "background":
                 out[sources + 1 + parameter.slot, k] = 1.0
             elif parameter.name == "position_scatter":

@@ -8,7 +8,7 @@ frames.
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from scipy.special import gammaln, xlogy
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.io.serialize import serializable
 from bayesfred.model.kernels.likelihood import GAUSSIAN, POISSON
 
 NOTHING = 1e-300  # stands for an expected count of zero, at which nothing but zero can be counted
@@ -42,10 +43,8 @@ class Noise(Protocol):
     def residual(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         """(counts - mean) in standard deviations."""
 
-    def write(self, group: Any) -> None:
-        """Store the noise model in an HDF5 group."""
 
-
+@serializable("noise.poisson")
 @dataclass(frozen=True)
 class PoissonNoise(Noise):
     """Photon noise, with read noise as the shifted Poisson distribution.
@@ -106,11 +105,8 @@ class PoissonNoise(Noise):
     def residual(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         return (counts - mean) / np.sqrt(np.maximum(mean + self.shift, NOTHING))
 
-    def write(self, group: Any) -> None:
-        group.attrs["kind"] = np.bytes_("poisson")
-        group.attrs["read_noise"] = self.read_noise
 
-
+@serializable("noise.background")
 @dataclass(frozen=True)
 class BackgroundNoise(Noise):
     """The paper's noise: the sources' image is exact and only the background, Poisson(lambda), is random.
@@ -149,16 +145,6 @@ class BackgroundNoise(Noise):
 
     def residual(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         return np.asarray((counts - mean) / np.sqrt(background))
-
-    def write(self, group: Any) -> None:
-        group.attrs["kind"] = np.bytes_("background")
-
-
-def read_noise_model(group: Any) -> PoissonNoise | BackgroundNoise:
-    """The noise model stored in an HDF5 group."""
-    if group.attrs["kind"] == b"background":
-        return BackgroundNoise()
-    return PoissonNoise(float(group.attrs["read_noise"]))
 
 
 def simulate(

@@ -7,7 +7,7 @@ row of `SOURCE_NUISANCES` and a field of the kernels' `Nuisance` tuple.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -16,10 +16,12 @@ from scipy import stats
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.io.serialize import serializable
 
 FluxMode = Literal["fixed", "scale", "free"]
 
 
+@serializable("nuisances")
 @dataclass(frozen=True)
 class Nuisances:
     """What else is unknown beside the distortion and a constant background.
@@ -103,23 +105,6 @@ class Nuisances:
     def names(self) -> tuple[str, ...]:
         """All nuisance parameters but the constant background."""
         return (*self.source_names, *self.background_names[1:])
-
-    def write(self, group: Any) -> None:
-        """Store the choices in an HDF5 group."""
-        for f in fields(self):
-            value = getattr(self, f.name)
-            group.attrs[f.name] = (
-                0.0 if value is None else np.bytes_(value) if isinstance(value, str) else value
-            )
-
-    @classmethod
-    def read(cls, group: Any) -> "Nuisances":
-        """The choices stored in an HDF5 group by `write`."""
-        a = group.attrs
-        footprint = float(a["footprint"]) or None
-        flux: Any = bytes(a["flux"]).decode()
-        order, scatter = int(a["background_order"]), bool(a["position_scatter"])
-        return cls(flux, bool(a["offset"]), bool(a["psf_sigma"]), order, footprint, scatter)
 
 
 class _Context(NamedTuple):
@@ -209,7 +194,7 @@ class Parameter:
     unit : str
         Its leading word, such as counts.
     pixels : int
-        Power of a pixel that multiplies it.
+        Power of a pixel that multiplies it; 0 where the basis of the distortion decides.
     neutral : float
         The value at which the parameter changes nothing; for the background, the frame's level.
     start : float
@@ -279,15 +264,18 @@ def parameter_table(
 
 
 def _distortion_terms(model: ForwardModel, context: _Context) -> list[Parameter]:
-    d, half = model.distortion, {"f": context.half_width, "g": context.half_height}
+    d = model.polynomial
+    f, g = d.largest_displacement(context.half_width, context.half_height)
+    scales = 0.1 / np.maximum(f / context.half_width, g / context.half_height)
+    terms = (*d.f_terms, *d.g_terms) if d.basis is None else ((0, 0, 0, 0),) * d.n_terms
     table = []
-    for slot, (name, term) in enumerate(zip(d.names, (*d.f_terms, *d.g_terms), strict=True)):
+    for slot, (name, term) in enumerate(zip(d.names, terms, strict=True)):
         i, j, m, n = term
         powers = tuple((v, p) for v, p in zip("uvxy", (m, n, i, j), strict=True) if p)
-        scale = 0.1 * half[name[0]] / (half["f"] ** (i + m) * half["g"] ** (j + n))
-        prior = stats.norm(0.0, scale)
+        letter, pixels = (name[0], 1 - sum(term)) if d.basis is None else ("", 0)
+        prior = stats.norm(0.0, scales[slot])
         table.append(
-            Parameter(name, name[0], powers, "", 1 - sum(term), 0.0, 0.0, prior, slot, "distortion")
+            Parameter(name, letter, powers, "", pixels, 0.0, 0.0, prior, slot, "distortion")
         )
     return table
 

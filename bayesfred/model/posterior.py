@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,15 +15,17 @@ import numpy.typing as npt
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
 from bayesfred.model.likelihood import FrameLikelihood
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise, read_noise_model
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
 from bayesfred.model.pixels import usable_pixels
 from bayesfred.model.protocol import TargetDensity
 
 
+@serializable("posterior")
 @dataclass(frozen=True, eq=False, init=False)
 class Posterior(TargetDensity):
     """Posterior of distortion, background and nuisances given a frame.
@@ -73,7 +75,7 @@ class Posterior(TargetDensity):
     noise: PoissonNoise | BackgroundNoise
     mask: Flags
     nuisances: Nuisances
-    extrapolation: FluxExtrapolation | None
+    extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
 
     def __init__(
         self,
@@ -96,8 +98,8 @@ class Posterior(TargetDensity):
             model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
             extrapolation,
         )  # fmt: skip
-        for field, value in zip(fields(self), values, strict=True):
-            object.__setattr__(self, field.name, value)
+        for name, value in zip((f.name for f in fields(self)), values, strict=True):
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "prior", self._with_defaults(dict(prior or {})))
 
     def _with_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -294,24 +296,4 @@ class Posterior(TargetDensity):
         return InputError(f"params: got shape {np.shape(params)}, expected {expected} for {names}")
 
     def __getstate__(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def write(self, group: Any) -> None:
-        """Store frame, mask, model, noise, nuisances and priors in an HDF5 group."""
-        group.create_dataset("counts", data=self.counts, fletcher32=True)
-        group.create_dataset("mask", data=self.mask, fletcher32=True)
-        for name in ("model", "noise", "nuisances"):
-            getattr(self, name).write(group.create_group(name))
-        priors.write(self.prior, group.create_group("prior"))
-
-    @classmethod
-    def read(cls, group: Any) -> "Posterior":
-        """The posterior stored in an HDF5 group by `write`."""
-        return cls(
-            ForwardModel.read(group["model"]),
-            group["counts"][()],
-            prior=priors.read(group["prior"]),
-            noise=read_noise_model(group["noise"]),
-            mask=group["mask"][()],
-            nuisances=Nuisances.read(group["nuisances"]),
-        )
+        return {f.name: getattr(self, f.name) for f in fields(self)}

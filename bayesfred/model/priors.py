@@ -130,26 +130,3 @@ def slope(distribution: Any, x: float) -> tuple[float, float]:
     shapes, loc, scale = _standard(distribution)
     _, first, second = DENSITIES[distribution.dist.name](np.array((x - loc) / scale), shapes)
     return float(first) / scale, float(second) / scale**2
-
-
-def write(prior: Mapping[str, Any], group: Any) -> None:
-    """Store priors in an HDF5 group: one attribute array (shapes..., loc, scale) a parameter, beside its family."""
-    for name, distribution in prior.items():
-        shapes, loc, scale = _standard(distribution)
-        item = group.create_group(name)
-        item.attrs["family"] = np.bytes_(distribution.dist.name)
-        item.attrs["parameters"] = [*shapes, loc, scale]
-
-
-def read(group: Any) -> dict[str, Any]:
-    """The priors stored in an HDF5 group by `write`."""
-    prior = {}
-    for name in group:
-        family, values = (
-            bytes(group[name].attrs["family"]).decode(),
-            [float(v) for v in group[name].attrs["parameters"]],
-        )
-        if family not in DENSITIES:
-            raise InputError(f"prior {name}: unknown family {family!r} in the file")
-        prior[name] = getattr(stats, family)(*values[:-2], loc=values[-2], scale=values[-1])
-    return prior

@@ -43,17 +43,9 @@ def _effect(posterior: Posterior, sd: Floats, vectors: Floats) -> Floats:
     u for x, such as u x against x^2, move nothing: where the distortion is small no frame tells
     these terms apart, and nothing depends on it.
     """
-    d = posterior.model.distortion
+    d = posterior.model.polynomial
     half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
     x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, 9).T))
-    powers = np.array([*d.f_terms, *d.g_terms])
-    moves = (
-        sd[: d.n_terms]
-        * x[:, None] ** (powers[:, 0] + powers[:, 2])
-        * y[:, None] ** (powers[:, 1] + powers[:, 3])
-    )
-    f = np.arange(d.n_terms) < len(d.f_terms)
-    squares = sum(
-        ((moves[:, part] @ vectors[: d.n_terms][part]) ** 2).sum(axis=0) for part in (f, ~f)
-    )
+    moves = d.design_matrix(x, y, x, y).reshape(-1, d.n_terms) * sd[: d.n_terms]
+    squares = ((moves @ vectors[: d.n_terms]) ** 2).sum(axis=0)
     return np.asarray(squares / (moves**2).sum() + (vectors[d.n_terms :] ** 2).sum(axis=0))

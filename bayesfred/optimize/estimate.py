@@ -1,14 +1,15 @@
 """The maximum of a posterior with its Laplace approximation, as a record."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from bayesfred._typing import Floats
+from bayesfred.io.serialize import serializable
 
 
+@serializable("map_estimate")
 @dataclass(frozen=True, eq=False)
 class MapEstimate:
     """The posterior's maximum.
@@ -40,28 +41,6 @@ class MapEstimate:
     message: str
     at_maximum: bool = True
     fits_data: bool = True
-
-    def write(self, group: Any) -> None:
-        """Store the estimate in an HDF5 group."""
-        group.create_dataset("params", data=self.params)
-        group.create_dataset("covariance", data=self.covariance)
-        group.attrs["message"] = np.bytes_(self.message.encode())
-        for name in ("log_prob", "n_evaluations", "at_maximum", "fits_data"):
-            group.attrs[name] = getattr(self, name)
-
-    @classmethod
-    def read(cls, group: Any) -> "MapEstimate":
-        """The estimate stored in an HDF5 group by `write`."""
-        a = group.attrs
-        return cls(
-            group["params"][()],
-            group["covariance"][()],
-            float(a["log_prob"]),
-            int(a["n_evaluations"]),
-            bytes(a["message"]).decode(),
-            bool(a["at_maximum"]),
-            bool(a["fits_data"]),
-        )
 
 
 def inverse(matrix: Floats) -> Floats:

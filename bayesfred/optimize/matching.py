@@ -75,21 +75,18 @@ class Field:
 
     def predict(self, z: Floats) -> Floats:
         """Where the sources are imaged, shape (n, 2); without an image, their own position."""
-        n = self.posterior.model.distortion.n_terms
-        offset = z[n:] if z.size > n else np.zeros(2)
+        d = self.posterior.model.polynomial
+        offset = z[d.n_terms :] if z.size > d.n_terms else np.zeros(2)
+        theta = d.monomial_coefficients(z[: d.n_terms].copy())
         sigma = self.posterior.model.psf.sigma
-        return np.asarray(image_positions(self.optics, z[:n].copy(), *offset, sigma))
+        return np.asarray(image_positions(self.optics, theta, *offset, sigma))
 
     def design(self, sources: Ints, position: Floats) -> Floats:
         """Matrix (2, n, k) of the equations for sources imaged at these positions."""
-        d, o = self.posterior.model.distortion, self.optics
-        u, v = position.T[:, :, None]
+        d, o = self.posterior.model.polynomial, self.optics
         matrix = np.zeros((2, len(sources), self.columns.size))
-        matrix[0, :, : len(d.f_terms)] = (
-            o.f_lever[sources] * u ** o.f_powers[:, 0] * v ** o.f_powers[:, 1]
-        )
-        matrix[1, :, len(d.f_terms) : d.n_terms] = (
-            o.g_lever[sources] * u ** o.g_powers[:, 0] * v ** o.g_powers[:, 1]
+        matrix[:, :, : d.n_terms] = d.design_matrix(
+            position[:, 0], position[:, 1], o.x[sources], o.y[sources]
         )
         if self.columns.size > d.n_terms:
             matrix[0, :, -2] = matrix[1, :, -1] = -1.0

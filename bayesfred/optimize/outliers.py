@@ -26,7 +26,6 @@ from scipy import ndimage, spatial
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
-from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import image_positions
 from bayesfred.model.posterior import Posterior
@@ -125,7 +124,8 @@ class _Residuals:
         self.posterior, self.params = posterior, params
         self.width = s = np.hypot(model.psf.sigma / step, 12.0**-0.5)
         known = dict(zip(names, params, strict=True))
-        theta = params[: model.distortion.n_terms].copy()
+        d = model.polynomial
+        theta = d.monomial_coefficients(params[: d.n_terms].copy())
         offset = [known.get(name, 0.0) for name in ("offset_x", "offset_y")]
         u, v = image_positions(model.optics(), theta, *offset, model.psf.sigma).T / step
         ny, nx = model.detector.shape
@@ -196,10 +196,9 @@ class _Residuals:
         Those that it cannot have imaged are rendered as the PSF alone.
         """
         model = self.posterior.model
-        assert isinstance(model.distortion, PolynomialDistortion), "others are not fitted"
         theta = self.params[: model.distortion.n_terms]
         v, u = (positions - 0.5 * (np.array(model.detector.shape) - 1.0)).T * model.detector.binning
-        x, y = model.distortion.object_position(theta, u, v)
+        x, y = model.polynomial.object_position(theta, u, v)
         known = np.isfinite(x + y)
         image = _signed_image(model, theta, x[known], y[known], flux[known])
         if not np.isfinite(image).all():

@@ -1,0 +1,217 @@
+"""Sections of a run file that describe objects, and what is said of a section with a mistake.
+
+The keys of such a section are the fields of a class: :func:`described` makes the pydantic model of
+the section from the class, and the class checks the values. So a new PSF family or noise model,
+registered with `bayesfred.io.serialize`, can be named in a run file without a change here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import json
+import re
+import reprlib
+import types
+from dataclasses import MISSING, fields
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+
+from bayesfred.errors import InputError
+from bayesfred.imaging.detector import Detector
+from bayesfred.io.serialize import kinds
+from bayesfred.model.parameters import Nuisances
+
+__all__ = [
+    "TOO_DEEP",
+    "Float",
+    "Name",
+    "ObjectSettings",
+    "Section",
+    "described",
+    "mistake",
+    "model_of",
+]
+
+# Far outside what frames need, and far inside what float64, int64 and memory hold.
+LARGEST = 1e15
+Name = Annotated[str, Field(min_length=1, max_length=1000)]
+Float = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Integer = Annotated[int, Field(ge=-(10**15), le=10**15)]
+
+TOO_DEEP = "got tables or arrays nested too deeply, expected sections of key = value"
+
+# The class of a section; or the kind that it has by default, where a key `kind` chooses the class.
+CLASSES: dict[str, type] = {"detector": Detector, "nuisances": Nuisances}
+DEFAULT_KINDS = {"psf": "gaussian", "noise": "poisson"}
+
+# What a frame or an image supplies is not known yet when a run file is checked.
+STAND_INS: dict[type, dict[str, Any]] = {Detector: {"shape": (1, 1)}}
+STAND_IN_IMAGE = np.ones((3, 3))
+
+
+class Section(BaseModel):
+    """A table of a run file; its fields are the keys."""
+
+    # strict: TOML has types of its own, so 'true' or '3' is never taken for a number.
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class ObjectSettings(Section):
+    """A section whose keys are the fields of a class.
+
+    In place of a field that holds an array, the key `path` names the file of an image.
+
+    Attributes
+    ----------
+    made : type
+        The class.
+    given : dict
+        Fields that are no keys, with stand-ins.
+    """
+
+    made: ClassVar[type]
+    given: ClassVar[dict[str, Any]]
+
+    def make(self, **given: Any) -> Any:
+        """Make the object; `given` are the fields that are no keys of the section.
+
+        Raises
+        ------
+        InputError
+            The class refuses a value.
+        """
+        names = {field.name for field in fields(self.made)} & set(type(self).model_fields)
+        return self.made(**given, **{name: getattr(self, name) for name in names})
+
+    @model_validator(mode="after")
+    def _accepted_by_the_class(self) -> ObjectSettings:
+        try:
+            self.make(**self.given)
+        except InputError as error:
+            # what is wrong with a stand-in is wrong with no key
+            if not self.given or any(
+                f"{key}: got" in str(error) for key in type(self).model_fields
+            ):
+                raise
+        return self
+
+
+@cache
+def _describing(made: type, kind: str | None = None) -> type[ObjectSettings]:
+    """The section that describes objects of a class."""
+    hints = get_type_hints(made)
+    keys: dict[str, Any] = {} if kind is None else {"kind": (Literal[kind], kind)}
+    given = dict(STAND_INS.get(made, {}))
+    for field in fields(made):
+        key = _key(hints[field.name])
+        if key is None:
+            given[field.name], keys["path"] = STAND_IN_IMAGE, (Name, ...)
+        elif field.name not in given:
+            keys[field.name] = (key, ... if field.default is MISSING else field.default)
+    model: type[ObjectSettings] = create_model(made.__name__, __base__=ObjectSettings, **keys)
+    model.made, model.given = made, given
+    return model
+
+
+def _key(hint: Any) -> Any:
+    """The type of a key from that of a field, within bounds; None for an array."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return Union[tuple(key for key in map(_key, get_args(hint)) if key is not None)]  # noqa: UP007
+    if get_origin(hint) is np.ndarray:
+        return None
+    return {float: Float, int: Integer, str: Name}.get(hint, hint)
+
+
+def model_of(section: str, table: Any) -> type[ObjectSettings]:
+    """The model of a section that describes an object, which may depend on the table's `kind`."""
+    if section in CLASSES:
+        return _describing(CLASSES[section])
+    known, kind = kinds(section), DEFAULT_KINDS[section]
+    if isinstance(table, dict):
+        kind = table.get("kind", kind)
+    if not isinstance(kind, str) or kind not in known:
+        *most, last = map(repr, known)
+        raise ValueError(f"kind: got {reprlib.repr(kind)}, expected {', '.join(most)} or {last}")
+    return _describing(known[kind], kind)
+
+
+def described(section: str, table: Any) -> ObjectSettings:
+    """Check the table of a section that describes an object.
+
+    Parameters
+    ----------
+    section : str
+        One of `detector`, `psf`, `noise` and `nuisances`.
+    table : dict
+        As read from JSON.
+
+    Returns
+    -------
+    ObjectSettings
+
+    Raises
+    ------
+    ValidationError, ValueError
+        With every mistake.
+
+    Examples
+    --------
+    >>> described("psf", {"kind": "moffat", "fwhm": 4.0, "beta": 3}).make()
+    MoffatPSF(fwhm=4.0, beta=3.0)
+    """
+    return model_of(section, table).model_validate_json(json.dumps(table))
+
+
+def mistake(details: Any, root: type[Section], table: Any) -> str:
+    """Say one of pydantic's errors as `section.key: got X, expected Y`.
+
+    Parameters
+    ----------
+    details : ErrorDetails
+        The error.
+    root : type
+        The model of the whole run file.
+    table : dict
+        The run file.
+    """
+    location, kind, message = details["loc"], details["type"], details["msg"]
+    where = ".".join(map(str, location))
+    if kind == "json_invalid":
+        return TOO_DEEP
+    if kind == "missing":
+        return f"{where}: missing, expected a value"
+    if kind == "extra_forbidden":
+        known = _known_keys(root, location[:-1], table)
+        near = difflib.get_close_matches(str(location[-1]), known, n=1)
+        advice = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
+        kind = DEFAULT_KINDS.get(location[0])
+        of = f" with kind = {table[location[0]].get('kind', kind)!r}" if kind else ""
+        return f"{where}: unknown key{of}, {advice}"
+    if kind == "value_error":
+        # a class begins with the name of the field, and some with that of the section before it
+        text = str(details["ctx"]["error"]).removeprefix(f"{where}: ")
+        key, _, rest = text.partition(": ")
+        return f"{where}.{key}: {rest}" if rest and key.isidentifier() else f"{where}: {text}"
+    expected = re.sub(r"^\w+ should (be )?", "", message).replace("an object", "a table")
+    expected = re.sub(r"^(greater|less)", r"a number \1", re.sub(r"^have ", "one with ", expected))
+    return f"{where}: got {reprlib.repr(details['input'])}, expected {expected}"
+
+
+def _known_keys(root: type[Section], location: tuple[str | int, ...], table: Any) -> list[str]:
+    """The keys of the section at a location in the run file."""
+    section: type[BaseModel] = root
+    for name in map(str, location):
+        if name in (*CLASSES, *DEFAULT_KINDS):
+            section = model_of(name, table[name])
+            continue
+        annotation = section.model_fields[name].annotation
+        section = next(
+            candidate
+            for candidate in (annotation, *get_args(annotation))
+            if inspect.isclass(candidate) and issubclass(candidate, BaseModel)
+        )
+    return list(section.model_fields)
