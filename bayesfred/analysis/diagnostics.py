@@ -24,7 +24,7 @@ import arviz_base
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chainfile import Chain
@@ -36,6 +36,7 @@ MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
 FEWEST = 100  # draws from which a sensitivity is read
 FLAT = 1e-6  # difference of log densities that moves no posterior
+FIELD_POINTS = 9  # along each axis of the frame
 INFORMATIVE = 0.05  # sensitivity; the threshold of Kallioinen et al., and of arviz
 
 
@@ -80,6 +81,8 @@ class Diagnostics:
         where draws are too few or do not vary.
     prior_dominated : tuple of str
         Parameters whose prior sensitivity is at least 0.05: not the frame alone decides about them.
+        Of the distortion's coefficients, those alone whose displacement the prior decides too: its
+        sensitivity, along the pattern of the coefficient over the frame, is at least 0.05 as well.
     """
 
     converged: bool
@@ -138,6 +141,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
     acceptance = float(np.mean(chain.accepted)) / total_steps
     converged, message = _verdict(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
     prior, likelihood = _sensitivities(chain, posterior)
+    dominated = prior >= INFORMATIVE
+    dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
     return Diagnostics(
         converged=converged,
         message=message,
@@ -149,9 +154,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         n_draws=n_ensembles * n_steps * n_walkers,
         prior_sensitivity=_by_name(names, prior),
         likelihood_sensitivity=_by_name(names, likelihood),
-        prior_dominated=tuple(
-            name for name, value in zip(names, prior, strict=True) if value >= INFORMATIVE
-        ),
+        prior_dominated=tuple(np.array(names)[dominated].tolist()),
         **fit_statistics(posterior, chain.estimate.params),
     )
 
@@ -182,12 +185,42 @@ def autocorrelation_time(series: Floats, window: float = 5.0) -> float:
     return float(tau[closed[0] if closed.size else -1])
 
 
+def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
+    """Which of these parameters matter to what is measured, shape (number of parameters,).
+
+    A frame hardly tells u x from x^2, as u is nearly x: it knows the sum of two such coefficients,
+    the prior their difference, and the difference moves nothing. So a coefficient of the distortion
+    is judged by displacements. With W the design matrix of f and g at points all over the frame,
+    W theta is the displacement, and (W^T W theta)_k its component along the pattern that a unit of
+    coefficient k makes. It is this component whose sensitivity to the prior counts.
+    """
+    d = posterior.model.polynomial
+    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
+    x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, FIELD_POINTS).T))
+    u, v = d.image_position(chain.estimate.params[: d.n_terms], x, y)
+    imaged = np.isfinite(u + v)
+    design = d.design_matrix(u[imaged], v[imaged], x[imaged], y[imaged]).reshape(-1, d.n_terms)
+    terms = parameters[parameters < d.n_terms]
+    visible = np.ones(parameters.size, dtype=bool)
+    if terms.size:
+        draws = _draws(chain)
+        components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
+        names = tuple(chain.parameter_names[k] for k in terms)
+        sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
+        visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
+    return visible
+
+
+def _draws(chain: Chain) -> Floats:
+    """All draws after burn-in, walker by walker, shape (n, d)."""
+    kept = chain.chain[:, chain.burn_in :]
+    return kept.swapaxes(1, 2).reshape(-1, len(chain.parameter_names))
+
+
 def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats]:
     """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
     names = chain.parameter_names
-    draws = (
-        chain.chain[:, chain.burn_in :].swapaxes(1, 2).reshape(-1, len(names))
-    )  # walker by walker
+    draws = _draws(chain)
     log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
     log_prior = posterior.log_prior(draws)
     return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
