@@ -195,19 +195,19 @@ def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
     coefficient k makes. It is this component whose sensitivity to the prior counts.
     """
     d = posterior.model.polynomial
+    visible = np.ones(parameters.size, dtype=bool)
+    terms = parameters[parameters < d.n_terms]
+    if not terms.size:
+        return visible
     half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
     x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, FIELD_POINTS).T))
     u, v = d.image_position(chain.estimate.params[: d.n_terms], x, y)
     imaged = np.isfinite(u + v)
     design = d.design_matrix(u[imaged], v[imaged], x[imaged], y[imaged]).reshape(-1, d.n_terms)
-    terms = parameters[parameters < d.n_terms]
-    visible = np.ones(parameters.size, dtype=bool)
-    if terms.size:
-        draws = _draws(chain)
-        components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
-        names = tuple(chain.parameter_names[k] for k in terms)
-        sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
-        visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
+    draws, names = _draws(chain), tuple(chain.parameter_names[k] for k in terms)
+    components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
+    sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
+    visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
     return visible
 
 
