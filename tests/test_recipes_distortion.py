@@ -60,7 +60,7 @@ def counts() -> Floats:
 
 def posterior_of(distortion: bf.PolynomialDistortion, counts: Floats) -> bf.Posterior:
     """With priors that say next to nothing, so that the likelihood alone makes the maximum."""
-    prior = {name: FLAT for name in distortion.names}
+    prior = dict.fromkeys(distortion.names, FLAT)
     return bf.Posterior(model_of(distortion), counts, prior=prior)
 
 
@@ -170,7 +170,7 @@ def test_the_maximum_and_its_errors_are_the_same(
 def test_free_fluxes_are_profiled_alike(counts: Floats) -> None:
     """`near` extrapolates fluxes in theta, whatever its basis."""
     nuisances = bf.Nuisances("free")
-    prior = {name: FLAT for name in BASIS.names}
+    prior = dict.fromkeys(BASIS.names, FLAT)
     posterior = bf.Posterior(model_of(BASIS), counts, prior=prior, nuisances=nuisances)
     best = bf.find_map(posterior)
     assert best.converged
