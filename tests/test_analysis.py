@@ -205,7 +205,9 @@ def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None 
         n_parameters=2,
         noise=noise,
         nuisances=Nuisances("scale"),
-        model=SimpleNamespace(sources=SimpleNamespace(flux=np.ones(1))),
+        model=SimpleNamespace(
+            sources=SimpleNamespace(flux=np.ones(1)), polynomial=SimpleNamespace(n_terms=0)
+        ),
         expected_counts=lambda params: params[0] * spot + params[1],
         log_prior=lambda draws: np.zeros(len(draws)),
     )

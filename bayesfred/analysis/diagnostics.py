@@ -25,7 +25,7 @@ import arviz_base
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
 from bayesfred.sampling.chain import Chain
@@ -37,6 +37,7 @@ MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
 FEWEST = 100  # draws from which a sensitivity is read
 FLAT = 1e-6  # difference of log densities that moves no posterior
+FIELD_POINTS = 9  # along each axis of the frame
 INFORMATIVE = 0.05  # sensitivity; the threshold of Kallioinen et al., and of arviz
 
 
@@ -86,6 +87,9 @@ class Diagnostics:
         where draws are too few or do not vary.
     prior_dominated : tuple of str
         Parameters whose prior sensitivity is at least 0.05: the frame alone does not decide them.
+        A coefficient of the distortion is among them only if the prior decides a displacement that
+        it takes part in: the sensitivity of the displacement along the coefficient's pattern over
+        the frame is at least 0.05 too.
     """
 
     sampled_well: bool
@@ -171,6 +175,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         f"{min(bulk.min(), tail.min()):.0f}, acceptance {acceptance:.1%}."
     )
     prior, likelihood = _sensitivities(chain, posterior)
+    dominated = prior >= INFORMATIVE
+    dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
     return Diagnostics(
         sampled_well=not failures,
         fits_data=fits_data,
@@ -183,9 +189,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         n_draws=n_ensembles * n_steps * n_walkers,
         prior_sensitivity=_by_name(names, prior),
         likelihood_sensitivity=_by_name(names, likelihood),
-        prior_dominated=tuple(
-            name for name, value in zip(names, prior, strict=True) if value >= INFORMATIVE
-        ),
+        prior_dominated=tuple(np.array(names)[dominated].tolist()),
         **fit,
     )
 
@@ -216,12 +220,42 @@ def autocorrelation_time(series: Floats, window: float = 5.0) -> float:
     return float(tau[closed[0] if closed.size else -1])
 
 
+def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
+    """Which of these parameters matter to what is measured, shape (number of parameters,).
+
+    A frame hardly tells u x from x^2, as u is nearly x: it knows the sum of two such coefficients,
+    the prior their difference, and the difference moves nothing. So a coefficient of the distortion
+    is judged by displacements. With W the design matrix of f and g at points all over the frame,
+    W theta is the displacement, and (W^T W theta)_k its component along the pattern that a unit of
+    coefficient k makes. It is this component whose sensitivity to the prior counts.
+    """
+    d = posterior.model.polynomial
+    visible = np.ones(parameters.size, dtype=bool)
+    terms = parameters[parameters < d.n_terms]
+    if not terms.size:
+        return visible
+    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
+    x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, FIELD_POINTS).T))
+    u, v = d.image_position(chain.estimate.params[: d.n_terms], x, y)
+    imaged = np.isfinite(u + v)
+    design = d.design_matrix(u[imaged], v[imaged], x[imaged], y[imaged]).reshape(-1, d.n_terms)
+    draws, names = _draws(chain), tuple(chain.parameter_names[k] for k in terms)
+    components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
+    sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
+    visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
+    return visible
+
+
+def _draws(chain: Chain) -> Floats:
+    """All draws after burn-in, walker by walker, shape (n, d)."""
+    kept = chain.chain[:, chain.burn_in :]
+    return kept.swapaxes(1, 2).reshape(-1, len(chain.parameter_names))
+
+
 def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats]:
     """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
     names = chain.parameter_names
-    draws = (
-        chain.chain[:, chain.burn_in :].swapaxes(1, 2).reshape(-1, len(names))
-    )  # walker by walker
+    draws = _draws(chain)
     log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
     log_prior = posterior.log_prior(draws)
     return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
