@@ -159,7 +159,9 @@ def _centred(n: int) -> Floats:
 def _box_order(width: float, beta: float) -> int:
     """Smallest Gauss-Legendre order q that integrates the PSF over a pixel to BOX_TOLERANCE.
 
-    The PSF is a Gaussian or a Moffat function, the pixel `width` sigma wide. Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some
+    The PSF is a Gaussian or a Moffat function, the pixel `width` sigma wide.
+
+    Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some
     point of it. The even derivatives of F = exp(-x^2 / 2 s^2) are largest at x = 0 (its Fourier
     transform is positive), where they are (2q-1)!! / s^(2q) with (2q-1)!! = (2q)! / (2^q q!). So,
     per unit of h, it is at most

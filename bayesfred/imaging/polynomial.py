@@ -168,10 +168,11 @@ class Polynomial:
         array([[600.,   0.],
                [  0.,   4.]])
         """
-        point, split = broadcast(u, v, x, y), len(self.f_terms)
-        design = np.zeros((2, *point[0].shape, split + len(self.g_terms)))
-        design[0, ..., :split] = monomials(self.f_terms, point)
-        design[1, ..., split:] = monomials(self.g_terms, point)
+        split = len(self.f_terms)
+        each = monomials((*self.f_terms, *self.g_terms), broadcast(u, v, x, y))
+        design = np.zeros((2, *each.shape))
+        design[0, ..., :split] = each[..., :split]
+        design[1, ..., split:] = each[..., split:]
         return design if self.basis is None else np.asarray(design @ self.basis)
 
     def largest_displacement(self, half_width: float, half_height: float) -> Floats:
