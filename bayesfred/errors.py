@@ -1,8 +1,11 @@
-"""The one exception for input that a user can mend; the command line turns it into one line and exit code 2."""
+"""The one exception for input that a user can correct.
+
+The command line turns it into one line and exit code 2.
+"""
 
 
 def printable(text: str) -> str:
-    r"""Text with its control characters, line ends and undecodable bytes spelt out, so that a terminal prints them.
+    r"""Text with its control characters, line ends and undecodable bytes escaped.
 
     Examples
     --------
@@ -15,12 +18,12 @@ def printable(text: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad input: the text is one printable line that says what was got, what was expected and what to do.
+    """Bad input: one printable line that says what was got, what was expected and what to do.
 
     Parameters
     ----------
     text : str
-        Whatever of it no terminal prints is spelt out.
+        Characters that no terminal prints are escaped.
     """
 
     def __init__(self, text: str) -> None:
