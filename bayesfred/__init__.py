@@ -1,4 +1,7 @@
-"""Posterior of an imaging system's field distortion. The public names; `__init__.pyi` says where each one lives."""
+"""Posterior of an imaging system's field distortion: the public names.
+
+`__init__.pyi` says where each one lives.
+"""
 
 import lazy_loader
 

@@ -11,10 +11,12 @@ from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
 from .model.noise import BackgroundNoise, PoissonNoise, simulate
-from .model.posterior import Nuisances, Posterior
+from .model.parameters import Nuisances
+from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
-from .sampling.chainfile import Chain, open_chain
+from .sampling.chain import Chain
+from .sampling.chainfile import open_chain
 from .sampling.moves import LaplaceMove
 from .sampling.sampler import sample
 

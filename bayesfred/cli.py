@@ -1,7 +1,8 @@
-"""The command line: options in, exit codes out. What a command does is in `runs.py`.
+"""The command line: options in, results printed, exit codes out. The work is in `commands.py`.
 
-Exit codes: 0 done, 2 bad input (one line, no traceback), 3 finished but not converged, verified or
-calibrated, 130 interrupted, or terminated, with everything saved.
+Exit codes: 0 done and trustworthy; 2 bad input (one line, no traceback); 3 finished, but not
+sampled well, or the model does not fit the counts, or a check does not hold; 130 interrupted or
+terminated with everything saved.
 """
 
 import signal
@@ -31,7 +32,7 @@ ChainFile = Annotated[
     Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run in the output file.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the output file.")]
 
 
 def _example() -> str:
@@ -50,21 +51,31 @@ def demo(
     ] = 1,
     overwrite: Overwrite = False,
 ) -> None:
-    """Simulate the paper's frame, fit it and report: 81 sources, 12 coefficients, Poisson counts."""
-    _run(lambda: bf.commands.demo(folder, seed=seed, overwrite=overwrite).diagnostics.converged)
+    """Simulate the paper's frame, fit it and report: 81 sources, 12 terms, Poisson counts."""
+    _run(
+        lambda: bf.commands.show_run(
+            bf.commands.demo(folder, seed=seed, overwrite=overwrite, say=print)
+        )
+    )
 
 
 @app.command()
 def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
-    """Draw the frame that [simulation] describes into [frame] path, and its source grid, if any, into [catalogue] path."""
-    _run(lambda: bf.commands.simulate_frame(run_file, overwrite=overwrite))
+    """Simulate the frame that [simulation] describes, and its source grid, if it has one."""
+    _run(
+        lambda: bf.commands.show_simulated(
+            bf.commands.simulate_frame(run_file, overwrite=overwrite)
+        )
+    )
 
 
 @app.command(epilog="A complete run file:\n\n" + _example())
 def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
     _run(
-        lambda: bf.commands.fit(run_file, resume=resume, overwrite=overwrite).diagnostics.converged
+        lambda: bf.commands.show_run(
+            bf.commands.fit(run_file, resume=resume, overwrite=overwrite, say=print)
+        )
     )
 
 
@@ -94,15 +105,18 @@ def study(
     resume: Resume = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Fit many simulated frames: how well a distortion can be known, and whether error bars hold."""
+    """Fit many simulated frames: how well can a distortion be known, and do error bars hold."""
     _run(
-        lambda: bf.commands.study(
-            run_file,
-            kind=kind and kind.value,
-            scheduler=scheduler,
-            workers=workers,
-            resume=resume,
-            overwrite=overwrite,
+        lambda: bf.commands.show_study(
+            bf.commands.study(
+                run_file,
+                kind=kind and kind.value,
+                scheduler=scheduler,
+                workers=workers,
+                resume=resume,
+                overwrite=overwrite,
+                say=print,
+            )
         )
     )
 
@@ -117,8 +131,8 @@ def report(
         ),
     ] = None,
 ) -> None:
-    """Judge a chain file anew and write its report, .html and .png, beside it."""
-    _run(lambda: bf.commands.report(chain_file, target_ess=target_ess).diagnostics.converged)
+    """Judge a chain file again and write its report, .html and .png, beside it."""
+    _run(lambda: bf.commands.show_run(bf.commands.report(chain_file, target_ess=target_ess)))
 
 
 @app.command()
@@ -129,7 +143,7 @@ def compare(
     ],
 ) -> None:
     """Rank models of one frame by how well they predict every pixel from the others."""
-    _run(lambda: bf.commands.compare(chain_files).reliable)
+    _run(lambda: bf.commands.show_comparison(bf.commands.compare(chain_files)))
 
 
 @app.command()
@@ -139,12 +153,14 @@ def verify(
         bool, typer.Option("--all", help="Every draw's log-probability, not 1,000 of them.")
     ] = False,
 ) -> None:
-    """Compute again what a chain file holds: hashes, log-probabilities, the maximum, the first steps from the seed."""
-    _run(lambda: bf.commands.verify(chain_file, every_draw=every_draw))
+    """Compute again what a chain file holds: hashes, log-probabilities, maximum, first steps."""
+    _run(
+        lambda: bf.commands.show_verification(bf.commands.verify(chain_file, every_draw=every_draw))
+    )
 
 
-def _run(work: "Callable[[], bool | None]") -> None:
-    """Do a command's work, which says whether all is well; bad input becomes one line and exit code 2."""
+def _run(work: "Callable[[], bool]") -> None:
+    """Do a command's work, which says whether all is well, and turn the outcome into exit codes."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # to end as after a Ctrl-C
     try:
         well = work()
@@ -153,12 +169,12 @@ def _run(work: "Callable[[], bool | None]") -> None:
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
         typer.echo(
-            "bayesfred: interrupted; what a run has sampled or a study has finished is saved: go "
-            "on with --resume",
+            "bayesfred: interrupted; what a run has sampled or a study has finished is saved: "
+            "resume it with --resume",
             err=True,
         )
         raise typer.Exit(130) from None
     finally:
         signal.signal(signal.SIGTERM, before)
-    if well is False:
+    if not well:
         raise typer.Exit(3)

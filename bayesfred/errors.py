@@ -1,11 +1,16 @@
-"""The one exception for input that a user can correct.
-
-The command line turns it into one line and exit code 2.
-"""
+"""The exception for input that a user can correct; the command line prints it and exits with 2."""
 
 
 def printable(text: str) -> str:
-    r"""Text with its control characters, line ends and undecodable bytes escaped.
+    r"""Escape what a terminal cannot print: control characters, line ends and undecodable bytes.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
 
     Examples
     --------
@@ -18,12 +23,12 @@ def printable(text: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad input: one printable line that says what was got, what was expected and what to do.
+    """Bad input: one printable line says what was got, what was expected and what to do.
 
     Parameters
     ----------
     text : str
-        Characters that no terminal prints are escaped.
+        Characters that a terminal cannot print are escaped.
     """
 
     def __init__(self, text: str) -> None:

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.io.serialize import kinds
-from bayesfred.model.posterior import Nuisances
+from bayesfred.model.parameters import Nuisances
 
 __all__ = [
     "TOO_DEEP",

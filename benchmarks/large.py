@@ -135,7 +135,7 @@ def main() -> int:
         f"peak memory {memory:.1f} GiB of {MEMORY:.0f}, frame "
         f"{posterior.counts.nbytes / 2**30:.2f}; chain file {size:.0f} MiB"
     )
-    return 0 if top.fits_data and verdict.converged and memory <= MEMORY else 1
+    return 0 if top.fits_data and verdict.sampled_well and memory <= MEMORY else 1
 
 
 if __name__ == "__main__":

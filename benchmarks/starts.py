@@ -152,7 +152,7 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 def scipys(posterior: bf.Posterior, method: str) -> np.ndarray:
     """Where one of scipy's optimisers ends from no distortion, with the exact gradient, in the priors' standard deviations."""
     origin = posterior.start()
-    scale = np.array([posterior.default_prior(name).std() for name in posterior.parameter_names])
+    scale = np.array([p.prior.std() for p in posterior.parameters])
 
     def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
         params = origin + scale * z

@@ -1,6 +1,9 @@
-"""The estimators of convergence and of sensitivity against known answers, and the measures of fit against simulated refits."""
+"""Convergence and sensitivity against known answers, measures of fit against simulated refits."""
 
+import re
 from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,11 +14,20 @@ from numpy.typing import NDArray
 from scipy.special import rel_entr, xlogy
 from scipy.stats import norm, poisson
 
-from bayesfred.analysis.diagnostics import autocorrelation_time, diagnose
-from bayesfred.model.noise import BackgroundNoise
-from bayesfred.model.posterior import Nuisances
+from bayesfred.analysis.diagnostics import Diagnostics, autocorrelation_time, diagnose
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import BackgroundNoise, simulate
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_statistics import deviance_moments
 from bayesfred.sampling.convergence import convergence, effective_size, rank_rhat
+from bayesfred.sampling.sampler import sample
 
 Floats = NDArray[np.float64]
 
@@ -193,7 +205,9 @@ def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None 
         n_parameters=2,
         noise=noise,
         nuisances=Nuisances("scale"),
-        model=SimpleNamespace(sources=SimpleNamespace(flux=np.ones(1))),
+        model=SimpleNamespace(
+            sources=SimpleNamespace(flux=np.ones(1)), polynomial=SimpleNamespace(n_terms=0)
+        ),
         expected_counts=lambda params: params[0] * spot + params[1],
         log_prior=lambda draws: np.zeros(len(draws)),
     )
@@ -419,13 +433,16 @@ def test_sensitivity_needs_draws_that_vary() -> None:
 
 
 def healthy_chain(**changes: Any) -> Any:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    counts = np.random.default_rng(16).poisson(profile() + 5.0).astype(float)
+    posterior = linear_posterior(counts, SimpleNamespace(read_noise=0.0))
     return chain_at(np.array([1.0, 5.0]), posterior, **changes)
 
 
-def test_healthy_chain_converges() -> None:
+def test_healthy_chain_is_trustworthy() -> None:
     result = diagnose(healthy_chain())
-    assert result.converged and result.message.startswith("converged")
+    assert result.sampled_well and result.fits_data and result.trustworthy
+    assert result.message.startswith("trustworthy: The model fits the counts: ")
+    assert "Sampled well: R-hat" in result.message
     assert result.acceptance == pytest.approx(12 / 15)
     assert result.n_draws == 4 * 12 * 32
     assert set(result.rhat) == set(result.tau) == {"flux_scale", "background"}
@@ -456,7 +473,42 @@ def shifted() -> Floats:
     ],
     ids=["ensembles disagree", "hardly accepts", "too short", "no draws", "no MAP"],
 )
-def test_faults_prevent_convergence_and_are_named(changes: dict[str, Any], reason: str) -> None:
+def test_faults_of_sampling_are_named(changes: dict[str, Any], reason: str) -> None:
     result = diagnose(healthy_chain(**changes))
-    assert not result.converged
+    assert not result.sampled_well and not result.trustworthy
+    assert result.fits_data and result.message.startswith("not trustworthy: The model fits ")
+    assert "Not sampled well: " in result.message
     assert reason in result.message and "\n" not in result.message
+
+
+def with_psf(sigma: float) -> tuple[MapEstimate, Diagnostics]:
+    """Maximum and verdict of a frame whose PSF is a Gaussian of 2.5 pixels, not of `sigma`."""
+    distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
+    sources = SourceCatalog.grid(3, 16.0, 5e3)
+
+    def model(width: float) -> ForwardModel:
+        return ForwardModel(Detector((60, 75)), sources, GaussianPSF(width), distortion)
+
+    counts = simulate(model(2.5), [2e-4, -3e-4], 3.0, seed=1)
+    posterior = Posterior(model(sigma), counts)
+    estimate = find_map(posterior)
+    with TemporaryDirectory() as folder:
+        chain = sample(posterior, estimate, path=Path(folder, "c.h5"), seed=1, progress=False)
+        return estimate, diagnose(chain)
+
+
+def test_a_psf_that_is_too_wide_is_sampled_well_and_does_not_fit() -> None:
+    estimate, verdict = with_psf(1.2 * 2.5)
+    assert estimate.at_maximum and not estimate.fits_data
+    assert verdict.sampled_well and not verdict.fits_data and not verdict.trustworthy
+    assert re.match(
+        r"not trustworthy: The model does not fit the counts: deviance \d+\.\d standard deviations "
+        r"above its expectation, expected at most 5\. Sampled well: R-hat",
+        verdict.message,
+    )
+
+
+def test_the_right_psf_is_trustworthy() -> None:
+    estimate, verdict = with_psf(2.5)
+    assert estimate.at_maximum and estimate.fits_data
+    assert verdict.sampled_well and verdict.fits_data and verdict.trustworthy

@@ -26,7 +26,8 @@ from bayesfred.analysis.executor import Answer
 from bayesfred.analysis.study_helpers import given, seeds
 from bayesfred.errors import InputError
 from bayesfred.io import tables
-from bayesfred.reporting import plots
+from bayesfred.reporting.studies import calibration_plot, noise_plot
+from bayesfred.reporting.style import png
 
 Floats = NDArray[np.float64]
 
@@ -286,7 +287,8 @@ def test_one_failed_cell_does_not_lose_the_others(tmp_path: Path) -> None:
     failed = study.replicates["message"][::2]
     assert all("cannot determine" in message for message in failed)
     assert "4 frames, 2 failed" in study.message
-    assert plots.png(plots.noise_plot(study)).startswith(b"\x89PNG")
+    parameters = bf.Posterior(tiny(), np.ones(tiny().detector.shape)).parameters
+    assert png(noise_plot(study, parameters)).startswith(b"\x89PNG")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -593,7 +595,7 @@ def test_right_error_bars_are_found_right_and_wrong_ones_wrong(tmp_path: Path) -
     assert not wrong.calibrated
     assert "intervals of" in wrong.message
     for result in (right, wrong):
-        assert plots.png(plots.calibration_plot(result)).startswith(b"\x89PNG")
+        assert png(calibration_plot(result, small().parameters)).startswith(b"\x89PNG")
 
 
 def test_frames_without_a_posterior_are_no_calibration(tmp_path: Path) -> None:
@@ -609,7 +611,7 @@ def test_frames_without_a_posterior_are_no_calibration(tmp_path: Path) -> None:
     assert not result.calibrated
     assert (result.n, result.n_failed) == (0, 3)
     assert "no posterior of 3 frames" in result.message
-    assert plots.png(plots.calibration_plot(result)).startswith(b"\x89PNG")
+    assert png(calibration_plot(result, small().parameters)).startswith(b"\x89PNG")
 
 
 def test_calibrations_that_cannot_be_are_refused(tmp_path: Path) -> None:
@@ -671,7 +673,9 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
     assert "8 frames, 0 failed" in capsys.readouterr().out
     table = tables.read_table("chains/run.noise.ecsv")
     assert (table.meta["study"], table.columns["task"].size) == ("noise", 8)
-    assert sorted(set(tables.read_table("chains/run.noise.summary.ecsv").columns["background"])) == [
+    assert sorted(
+        set(tables.read_table("chains/run.noise.summary.ecsv").columns["background"])
+    ) == [
         1.0,
         10.0,
     ]

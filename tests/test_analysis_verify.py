@@ -16,7 +16,7 @@ from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 
 STEPS = 15
 CHECKS = (

@@ -1,4 +1,4 @@
-"""What a camera does: distortion, catalogue, detector and forward model against slow, independent images."""
+"""Distortion, catalogue, detector and forward model against slow, independent images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import oracles
 import pytest
 from numpy.typing import NDArray
-from scipy.special import erf
+from scipy.special import erf, eval_jacobi
 
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
@@ -50,7 +50,7 @@ def random_distortion(rng: np.random.Generator) -> PolynomialDistortion:
 def random_theta(
     rng: np.random.Generator, distortion: PolynomialDistortion, shape: tuple[int, int], shift: float
 ) -> FloatArray:
-    """Coefficients with which each term moves a star at the fine frame's corner by about `shift` pixels."""
+    """Coefficients with which each term moves a star in the corner by about `shift` pixels."""
     half_y, half_x = shape[0] / 2, shape[1] / 2
     terms = (*distortion.f_terms, *distortion.g_terms)
     levers = np.array([half_x ** (i + m) * half_y ** (j + n) for i, j, m, n in terms])
@@ -349,7 +349,7 @@ def test_the_paper_s_kernel_loses_flux_in_the_corner() -> None:
 @pytest.mark.parametrize("conserve_flux", [True, False])
 @pytest.mark.parametrize("shift", [1.0, 6.0, 20.0])
 def test_every_pixel_above_the_tolerance_is_present(shift: float, conserve_flux: bool) -> None:
-    """Single stars under random distortions that do not fold in the frame, mild to strongly curved."""
+    """Single stars under random distortions, mild to strong, that do not fold in the frame."""
     rng = np.random.default_rng(int(shift))
     shape, tolerance, tried, truncated = (90, 110), 1e-8, 0, 0
     while tried < 40:
@@ -487,6 +487,114 @@ def test_named_bases() -> None:
     )
     assert PolynomialDistortion.pinhole().names[:4] == ("f_x2", "f_xy", "f_x3", "f_xy2")
     assert PolynomialDistortion.pinhole().names[4:] == ("g_xy", "g_y2", "g_x2y", "g_y3")
+
+
+def test_polynomial_has_every_term_of_x_and_y() -> None:
+    distortion = PolynomialDistortion.polynomial(3)
+    names = ("x", "y", "x2", "xy", "y2", "x3", "x2y", "xy2", "y3")
+    assert distortion.names == tuple(f"{letter}_{name}" for letter in "fg" for name in names)
+
+
+@pytest.mark.parametrize("radius", [250.0, 1.0])
+def test_zernike_polynomials_are_those_of_their_definition(radius: float) -> None:
+    """In polar coordinates, with Jacobi's polynomials for the radial part."""
+    degree = 6
+    distortion = PolynomialDistortion.zernike(degree, radius)
+    orders = [(n, m) for n in range(1, degree + 1) for m in range(-n, n + 1, 2)]
+    names = [f"z{n}_{'m' * (m < 0)}{abs(m)}" for n, m in orders]
+    assert distortion.names == tuple(f"{letter}_{name}" for letter in "fg" for name in names)
+    assert len(distortion.f_terms) == len(orders)
+    x, y = radius * np.random.default_rng(1).uniform(-1.0, 1.0, (2, 20))
+    r, phi = np.hypot(x, y) / radius, np.arctan2(y, x)
+    f, g = distortion.design_matrix(x, y, x, y)
+    for k, (n, m) in enumerate(orders):
+        half = (n - abs(m)) // 2
+        jacobi = eval_jacobi(half, abs(m), 0.0, 1.0 - 2.0 * r**2)
+        angular = np.cos(m * phi) if m >= 0 else np.sin(-m * phi)
+        constant = (-1.0) ** (n // 2) if m == 0 else 0.0
+        expected = (-1.0) ** half * r ** abs(m) * jacobi * angular - constant
+        assert f[:, k] == pytest.approx(expected, abs=1e-12)
+        assert g[:, len(orders) + k] == pytest.approx(expected, abs=1e-12)
+    assert not f[:, len(orders) :].any() and not g[:, : len(orders)].any()
+
+
+@pytest.mark.parametrize("focal_length", [800.0, 1.0])
+def test_lens_model_is_that_of_opencv(focal_length: float) -> None:
+    """As its documentation defines x'' and y'', in pixels of a camera matrix with f_x = f_y."""
+    distortion = PolynomialDistortion.radial_tangential(focal_length)
+    assert distortion.names == ("k1", "k2", "k3", "p1", "p2")
+    rng = np.random.default_rng(2)
+    x, y = 0.3 * focal_length * rng.uniform(-1.0, 1.0, (2, 20))
+    k1, k2, k3, p1, p2 = theta = np.array([-0.28, 0.07, 0.01, 2e-3, -1e-3])
+    a, b = x / focal_length, y / focal_length
+    r2 = a**2 + b**2
+    radial = 1.0 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = focal_length * (a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a**2))
+    v = focal_length * (b * radial + p1 * (r2 + 2.0 * b**2) + 2.0 * p2 * a * b)
+    image = distortion.image_position(theta, x, y)
+    assert np.array(image) == pytest.approx(np.array([u, v]), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("maker", "message"),
+    [
+        (lambda: PolynomialDistortion.polynomial(0), "degree: got 0, expected .* at least 1"),
+        (lambda: PolynomialDistortion.zernike(0), "degree: got 0, expected .* at least 1"),
+        (lambda: PolynomialDistortion.zernike(2, radius=0.0), "radius: got 0.0, expected"),
+        (lambda: PolynomialDistortion.radial_tangential(np.nan), "focal_length: got nan"),
+    ],
+)
+def test_bases_refuse_what_makes_no_sense(maker: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        maker()
+
+
+def test_largest_displacement_of_monomials_is_that_in_the_corner() -> None:
+    distortion = PolynomialDistortion.full_polynomial(4)
+    half_x, half_y = 60.0, 40.0
+    in_f, in_g = distortion.largest_displacement(half_x, half_y)
+    powers = [(i + m, j + n) for i, j, m, n in distortion.f_terms]
+    expected = np.array([half_x**along * half_y**across for along, across in powers])
+    n = len(powers)
+    assert in_f[:n] == pytest.approx(expected, rel=1e-14) and not in_f[n:].any()
+    assert in_g[n:] == pytest.approx(expected, rel=1e-14) and not in_g[:n].any()
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [PolynomialDistortion.zernike(6, 70.0), PolynomialDistortion.radial_tangential(200.0)],
+    ids=["zernike", "radial_tangential"],
+)
+def test_largest_displacement_bounds_that_of_every_source(
+    distortion: PolynomialDistortion,
+) -> None:
+    x, y = np.array([[60.0], [40.0]]) * np.random.default_rng(3).uniform(-1.0, 1.0, (2, 20000))
+    largest = distortion.largest_displacement(60.0, 40.0)
+    dense = np.abs(distortion.design_matrix(x, y, x, y)).max(axis=1)
+    # Between points h = 1/8 of a half-width apart, a polynomial of degree n = 6 (or 7) rises by
+    # at most the part (n h / 2)^2 / 2: 7 % (or 10 %).
+    assert (dense <= 1.1 * largest).all()
+    assert (dense >= 0.9 * largest).all()
+
+
+def test_a_coefficient_that_only_exchanges_u_for_x_has_a_displacement() -> None:
+    basis = [[1.0, 1.0], [-1.0, 1.0]]
+    distortion = PolynomialDistortion([(1, 0, 1, 0), (2, 0, 0, 0)], [], basis, "exchange both")
+    assert not distortion.design_matrix(5.0, 5.0, 5.0, 5.0)[0, 0]
+    assert distortion.largest_displacement(10.0, 10.0)[0] == pytest.approx([10.0, 200.0])
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (3, 4)])
+def test_design_matrix_is_the_displacement_of_unit_coefficients(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        distortion = random_distortion(rng)
+        point = rng.uniform(-3.0, 3.0, (4, *shape))
+        design = distortion.design_matrix(*point)
+        assert design.shape == (2, *shape, distortion.n_terms)
+        theta = rng.standard_normal(distortion.n_terms)
+        expected = np.array(distortion.displacement(theta, *point))
+        assert design @ theta == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
 @pytest.mark.parametrize(("degree", "count"), [(2, 7), (3, 23), (4, 53)])

@@ -33,7 +33,8 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import FWHM, PSF, GaussianPSF, MoffatPSF, SampledPSF
 from bayesfred.model.noise import simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chainfile import open_chain
 

@@ -14,7 +14,8 @@ from test_sampling_chain import reseal, run
 from bayesfred.errors import InputError
 from bayesfred.io import hdf5_checks, serialize
 from bayesfred.optimize.find_map import find_map
-from bayesfred.sampling.chainfile import Chain, open_chain, random_states
+from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import open_chain
 
 STEPS = 20
 
@@ -413,7 +414,7 @@ def test_no_state_of_random_numbers_is_refused(path: Path, part: int, value: obj
         file["ensemble_1"].attrs[f"random_state_{part}"] = value
     reseal(path)
     with pytest.raises(InputError, match=r"chain\.h5: damaged"):
-        random_states(path)
+        open_chain(path)
 
 
 @pytest.mark.parametrize(

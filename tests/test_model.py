@@ -21,7 +21,8 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, exp2, log, take_turn
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 
 Floats = NDArray[np.float64]
 Noise = PoissonNoise | BackgroundNoise
@@ -536,8 +537,8 @@ def test_workspaces_return_to_the_queue() -> None:
     for _ in range(5):
         posterior.log_prob(np.repeat(truth[None], 6, axis=0))
         posterior.gradient(truth)
-    assert isinstance(posterior._workspaces, queue.SimpleQueue)
-    assert posterior._workspaces.qsize() <= nb.config.NUMBA_NUM_THREADS
+    assert isinstance(posterior.likelihood._workspaces, queue.SimpleQueue)
+    assert posterior.likelihood._workspaces.qsize() <= nb.config.NUMBA_NUM_THREADS
 
 
 @pytest.mark.parametrize("noise", [PoissonNoise(), PoissonNoise(3.0), BackgroundNoise()])
@@ -558,3 +559,21 @@ def test_sigma_is_the_spread_of_drawn_counts(noise: PoissonNoise | BackgroundNoi
     # negative control: the root of the model's counts is the spread of plain photon noise alone
     plain = np.mean(drawn.var(axis=0, ddof=1) / (sources + level))
     assert (abs(plain - 1) > LIMIT * error) == (noise != PoissonNoise())
+
+
+@pytest.mark.parametrize(
+    "method", ["gradient", "fisher", "information", "expected_counts", "sigma", "fluxes"]
+)
+def test_several_vectors_are_refused_where_one_is_answered(method: str) -> None:
+    """Only `log_prob` and `log_prior` promise batches; the others used row 0 without a word."""
+    model = make_model()
+    posterior, truth = make_posterior(
+        model, make_truth(model, np.random.default_rng(1)), np.random.default_rng(2)
+    )
+    several, d = np.stack([truth, truth + 1.0]), truth.size
+    assert posterior.log_prob(several).shape == posterior.log_prior(several).shape == (2,)
+    expected = rf"params: got shape \(2, {d}\), expected one vector of shape \({d},\)"
+    with pytest.raises(InputError, match=expected):
+        getattr(posterior, method)(several)
+    with pytest.raises(InputError, match=expected):
+        posterior.simulate(several, np.random.default_rng(3))

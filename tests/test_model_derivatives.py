@@ -25,7 +25,8 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 
 Floats = NDArray[np.float64]
 

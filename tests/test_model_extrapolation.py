@@ -1,5 +1,7 @@
 """Free fluxes extrapolated from other parameters: the likelihood is the one that is searched for from nothing."""
 
+import copy
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from test_model import known, make_model, make_truth
 
 from bayesfred.analysis.verify import verify
+from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
@@ -17,7 +20,8 @@ from bayesfred.imaging.psf import MoffatPSF
 from bayesfred.model.extrapolation import FluxExtrapolation
 from bayesfred.model.kernels.extrapolate import ENOUGH
 from bayesfred.model.noise import PoissonNoise
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.sampler import sample
@@ -99,15 +103,13 @@ def test_far_from_it_log_prob_is_the_same(case: str) -> None:
 
 def changed(near: Posterior, **parts: Any) -> Posterior:
     """The same with other beliefs about the fluxes."""
-    assert isinstance(near._extrapolation, FluxExtrapolation)
-    other = near.near(near._extrapolation.params, np.full((near.n_parameters,) * 2, np.nan))
-    object.__setattr__(other, "_extrapolation", near._extrapolation._replace(**parts))
-    return other
+    assert isinstance(near.extrapolation, FluxExtrapolation)
+    return replace(near, extrapolation=near.extrapolation._replace(**parts))
 
 
 def test_wrong_beliefs_cost_time_alone_unless_they_are_about_the_hessian() -> None:
     posterior, near, best = solved("touching")
-    beliefs = near._extrapolation
+    beliefs = near.extrapolation
     assert beliefs is not None
     params = draws(best, 1.0)
     searched = posterior.log_prob(params)
@@ -124,7 +126,7 @@ def test_wrong_beliefs_cost_time_alone_unless_they_are_about_the_hessian() -> No
     assert np.abs(alone.log_prob(params) - searched).min() > 10 * AGREE
 
 
-def test_without_free_fluxes_there_is_nothing_to_foretell() -> None:
+def test_without_free_fluxes_there_is_nothing_to_extrapolate() -> None:
     model = make_model(APART)
     for nuisances in (Nuisances(), Nuisances("scale"), Nuisances("free", position_scatter=True)):
         posterior = Posterior(model, model.expected_counts(np.zeros(12), 3.0), nuisances=nuisances)
@@ -164,3 +166,20 @@ def test_a_chain_that_went_far_verifies(tmp_path: Path) -> None:
     path = tmp_path / "wide.h5"
     sample(posterior, wide, path=path, seed=4, walkers=8, steps=6, progress=False)
     assert {check.what: check.holds for check in verify(path)}["log-probability"]
+
+
+def test_copies_keep_the_extrapolation() -> None:
+    """Pickled, copied or with another prior: the same object state, so the same fast answers."""
+    _, near, best = solved("touching")
+    prior = {"background": near.prior["background"]}
+    for again in (pickle.loads(pickle.dumps(near)), copy.copy(near), replace(near, prior=prior)):
+        assert isinstance(again.extrapolation, FluxExtrapolation)
+        assert (
+            again.log_prob(draws(best, 1.0)).tobytes() == near.log_prob(draws(best, 1.0)).tobytes()
+        )
+
+
+def test_an_extrapolation_is_of_one_model() -> None:
+    _, near, _ = solved("touching")
+    with pytest.raises(InputError, match="extrapolation: got that of another model, expected"):
+        replace(near, model=replace(near.model, tolerance=1e-9))

@@ -17,7 +17,8 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import PoissonNoise, simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
 
 Floats = NDArray[np.float64]

@@ -25,11 +25,12 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling import ensembles
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.ensembles import adapted
 from bayesfred.sampling.moves import LaplaceMove

@@ -34,7 +34,8 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.io.serialize import read, serializable, write
 from bayesfred.model import priors
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances, parameter_table
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.sampler import sample
@@ -139,31 +140,36 @@ def test_make_takes_scipys_keywords() -> None:
     ).logpdf(1.0)
 
 
+def default_priors(
+    distortion: PolynomialDistortion, nuisances: Nuisances = Nuisances()
+) -> dict[str, Any]:
+    """Of a frame of 60 x 100 fine pixels with 3 counts a pixel and a PSF of 2.5 pixels."""
+    sources = SourceCatalog.grid(2, 10.0, 1e3)
+    model = ForwardModel(Detector((30, 50), 2), sources, GaussianPSF(2.5), distortion)
+    table = parameter_table(model, nuisances, np.full(1500, 3.0))
+    return {parameter.name: parameter.prior for parameter in table}
+
+
 def test_default_prior_moves_a_corner_star_by_a_tenth_of_the_half_width() -> None:
-    detector = Detector((30, 50), 2)
     for distortion in (PolynomialDistortion.full_polynomial(4), PolynomialDistortion.pinhole()):
         corner = {"u": 50.0, "v": 30.0, "x": 50.0, "y": 30.0}
+        defaults = default_priors(distortion)
         for k, name in enumerate(distortion.names):
-            scale = priors.default_prior(name, distortion, detector, 3.0, 2.5).std()
+            scale = defaults[name].std()
             moved = distortion.displacement(scale * np.eye(distortion.n_terms)[k], **corner)
-            assert moved[name[0] == "g"] == pytest.approx(
-                0.1 * (50.0 if name[0] == "f" else 30.0), rel=1e-12
-            )
+            expected = 0.1 * (50.0 if name[0] == "f" else 30.0)
+            assert moved[name[0] == "g"] == pytest.approx(expected, rel=1e-12)
 
 
 def test_default_priors_of_nuisances() -> None:
-    def default(name: str) -> Any:
-        return priors.default_prior(name, MIRRORED, Detector((30, 50), 2), 3.0, 2.5)
-
-    assert (default("offset_x").std(), default("offset_y").std()) == pytest.approx((5.0, 3.0))
-    assert (
-        default("background").support() == (0.0, math.inf)
-        and default("background").kwds == {} != default("background").args
-    )
-    assert default("background").median() == pytest.approx(30.0 * stats.halfnorm.median())
-    assert default("background_u2").std() == pytest.approx(3.0)
-    assert default("flux_scale").ppf(stats.norm.cdf(1.0)) == pytest.approx(math.e)
-    assert default("psf_sigma").support() == pytest.approx((1.5, 5.0))
+    free = Nuisances("scale", offset=True, psf_sigma=True, background_order=2)
+    default = default_priors(MIRRORED, free)
+    assert (default["offset_x"].std(), default["offset_y"].std()) == pytest.approx((5.0, 3.0))
+    assert default["background"].support() == (0.0, math.inf)
+    assert default["background"].median() == pytest.approx(30.0 * stats.halfnorm.median())
+    assert default["background_u2"].std() == pytest.approx(3.0)
+    assert default["flux_scale"].ppf(stats.norm.cdf(1.0)) == pytest.approx(math.e)
+    assert default["psf_sigma"].support() == pytest.approx((1.5, 5.0))
 
 
 # --- maximum --------------------------------------------------------------------------------------
@@ -232,7 +238,7 @@ def test_map_is_found_from_afar_and_reports_itself() -> None:
     assert np.array_equal(copy.params, best.params) and np.array_equal(
         copy.covariance, best.covariance
     )
-    fields = ("log_prob", "converged", "n_evaluations", "message")
+    fields = ("log_prob", "n_evaluations", "message", "at_maximum", "fits_data")
     assert [getattr(copy, name) for name in fields] == [getattr(best, name) for name in fields]
 
 
@@ -349,7 +355,7 @@ def test_a_frame_without_background_is_fitted_and_sampled(tmp_path: Path) -> Non
     best = find_map(posterior)
     assert best.at_maximum and best.params[2] < 1e-4
     chain = sample(posterior, best, path=tmp_path / "chain.h5", seed=1, progress=False)
-    assert diagnose(chain).converged
+    assert diagnose(chain).sampled_well
     # the marginal likelihood of the background, the distortion being known well
     level = np.linspace(0.0, 0.2, 2001)[1:]
     density = posterior.log_prob(

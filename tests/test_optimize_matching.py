@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import optimize, spatial
+from scipy import spatial
 
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
@@ -15,12 +16,17 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
+from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize import find_map as search
-from bayesfred.optimize import matching, newton
+from bayesfred.optimize import starts
 from bayesfred.optimize.find_map import find_map, reject_outliers
-from bayesfred.optimize.matching import Field, find_peaks, find_start, match, outward
+from bayesfred.optimize.growing_disk import maximize_outward
+from bayesfred.optimize.matching import Field, match
 from bayesfred.optimize.newton import NewtonResult, maximize
+from bayesfred.optimize.peaks import find_peaks
+from bayesfred.optimize.starts import find_start
 
 Floats = NDArray[np.float64]
 
@@ -188,7 +194,7 @@ def test_blends_of_unequal_stars_with_some_missing_and_some_spurious() -> None:
     assert (
         best.at_maximum
         and not best.fits_data
-        and "sources that the catalogue lacks or the frame misses" in best.message
+        and "unmatched sources or spurious detections" in best.message
     )
 
 
@@ -238,24 +244,24 @@ def test_no_start_folds(monkeypatch: pytest.MonkeyPatch) -> None:
         [2, 8]
     ] = -1e-3  # u^2 x and u^2 y: u - x - u^2 x / 1000 = 0 has no solution for the outer stars
     assert posterior.log_prob(np.append(folded, 2.0)) == -np.inf
-    monkeypatch.setattr(matching, "match", lambda field, peaks: (folded, np.zeros((12, 12)), 25))
-    begun = matching.find_start(posterior)
+    monkeypatch.setattr(starts, "match", lambda field, peaks: (folded, np.zeros((12, 12)), 25))
+    begun = starts.find_start(posterior)
     assert np.isfinite(posterior.log_prob(begun.params))
     # without the way back there would be nowhere to climb from
-    monkeypatch.setattr(matching, "_unfolded", lambda posterior, params, plain: params)
-    assert matching.find_start(posterior).path == "the prior's medians"
+    monkeypatch.setattr(starts, "with_density", lambda posterior, params, plain: params)
+    assert starts.find_start(posterior).path == "the prior's medians"
 
 
-def test_a_climb_that_ends_at_no_maximum_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_that_ends_at_no_maximum_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
     model = grid(side=5, distortion=MIRRORED)
     posterior = Posterior(model, simulate(model, np.zeros(12), 2.0, seed=7))
-    begun = matching.find_start(posterior)
+    begun = starts.find_start(posterior)
     lost = NewtonResult(
         begun.params, float(posterior.log_prob(begun.params)), np.full((13, 13), np.nan), np.inf, 9
     )
     monkeypatch.setattr(
         search,
-        "climb",
+        "maximize",
         lambda p, begin, **known: (
             lost if np.array_equal(begin, begun.params) else maximize(p, begin)
         ),
@@ -340,7 +346,7 @@ def test_a_disk_grows_where_positions_scatter_too() -> None:
         simulate(model, [1e-5, 2e-5], 2.0, seed=1),
         nuisances=Nuisances("free", position_scatter=True),
     )
-    params = outward(Field(posterior), posterior.start())
+    params = maximize_outward(Field(posterior), posterior.start())
     np.testing.assert_allclose(params[:2], [1e-5, 2e-5], atol=1e-6)
     assert params.size == posterior.n_parameters == 4
 
@@ -351,7 +357,7 @@ def test_overlapping_stars_are_found() -> None:
     truth = np.append(bent(model, 15.0), 1.0)
     posterior = Posterior(model, simulate(model, truth[:8], 1.0, seed=8))
     assert distance(posterior, truth) < 0.01
-    grown = maximize(posterior, outward(Field(posterior), posterior.start()))
+    grown = maximize(posterior, maximize_outward(Field(posterior), posterior.start()))
     assert grown.log_prob == pytest.approx(find_map(posterior, truth).log_prob, abs=1e-3)
 
 
@@ -458,18 +464,23 @@ def test_terms_that_differ_by_the_distortion_alone_are_not_refused() -> None:
     ).fits_data
 
 
-def test_a_search_that_ends_below_its_start_is_not_followed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    model = grid(7)
-    posterior = Posterior(model, simulate(model, np.zeros(4), 2.0, seed=3))
-    begin = posterior.start()
-    begin[0] += 5.0 / model.sources.x.max() ** 3
-    # the search is called at once, and returns a point at which the map folds
-    monkeypatch.setattr(newton, "AS_PREDICTED", 0.0)
-    monkeypatch.setattr(
-        newton, "_search", lambda *_: optimize.OptimizeResult(x=np.full(5, 1e9), fun=1.0, nfev=1)
-    )
-    assert not np.isfinite(posterior.log_prob(begin + 1e9))
-    reached = maximize(posterior, begin)
-    assert reached.log_prob > float(posterior.log_prob(begin)) and np.isfinite(reached.distance)
+class Misleading(TargetDensity):
+    """A normal density whose gradient points away from its top."""
+
+    parameter_names = ("x",)
+    support = np.array([-np.inf]), np.array([np.inf])
+
+    def log_prob(self, params: Any) -> Any:
+        return -0.5 * np.sum(np.square(params), axis=-1)
+
+    def gradient(self, params: Any) -> Floats:
+        return np.asarray(params, dtype=np.float64)
+
+    def information(self, params: Any) -> Floats:
+        return np.eye(1)
+
+
+def test_a_search_that_ends_below_its_start_is_not_followed() -> None:
+    """Neither Newton steps nor the search in their place gain anything; both end where they began."""
+    reached = maximize(Misleading(), np.array([1.0]))
+    assert reached.params == 1.0 and reached.log_prob == -0.5 and reached.distance == 1.0

@@ -14,11 +14,12 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import simulate
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.matching import Field
-from bayesfred.optimize.outliers import clip, settle
+from bayesfred.optimize.outliers import reject, reject_once
 
 Floats = NDArray[np.float64]
 
@@ -87,7 +88,7 @@ def test_missing_sources_and_foreign_spots_are_left_out_and_nothing_else(
     options: dict[str, Any],
 ) -> None:
     posterior, truth, missing, spots = frame(1, **options)
-    found = clip(posterior, truth)
+    found = reject_once(posterior, truth)
     assert np.flatnonzero(found.missing).tolist() == missing.tolist()
     column, row = pixels(posterior, spots)
     assert not found.posterior.mask[row, column].any()
@@ -99,12 +100,12 @@ def test_missing_sources_and_foreign_spots_are_left_out_and_nothing_else(
     assert 0.85 < found.posterior.mask.mean() < 1.0
     # negative control: of a frame that holds what the catalogue says nothing is left out
     clean, truth, *_ = frame(1, n=0, **options)
-    assert clip(clean, truth).posterior is clean
+    assert reject_once(clean, truth).posterior is clean
 
 
 def test_what_is_masked_is_the_light_of_the_spots() -> None:
     posterior, truth, _, spots = frame(1)
-    found, model = clip(posterior, truth), posterior.model
+    found, model = reject_once(posterior, truth), posterior.model
     foreign = ForwardModel(
         model.detector, SourceCatalog(*spots.T, np.full(8, FLUX)), model.psf, COMPLETE
     )
@@ -123,7 +124,7 @@ def test_a_faint_neighbour_of_a_bright_spot_is_not_missing() -> None:
         model, sources=SourceCatalog([6.0, *sources.x], [0.0, *sources.y], [4e4, *sources.flux])
     )
     posterior = Posterior(model, simulate(foreign, theta, BACKGROUND, seed=1))
-    found = clip(posterior, np.append(theta, BACKGROUND))
+    found = reject_once(posterior, np.append(theta, BACKGROUND))
     assert not found.missing.any() and not found.posterior.mask[50, 56]
     # negative control: in the filtered frame it stands in the spot's dark ring, and lacks more than
     # its light
@@ -137,7 +138,9 @@ def test_a_faint_neighbour_of_a_bright_spot_is_not_missing() -> None:
         ),
     )
     lacking = Posterior(foreign, simulate(without, theta, BACKGROUND, seed=1))
-    assert np.flatnonzero(clip(lacking, np.append(theta, BACKGROUND)).missing).tolist() == [1]
+    assert np.flatnonzero(reject_once(lacking, np.append(theta, BACKGROUND)).missing).tolist() == [
+        1
+    ]
 
 
 def test_spots_are_bent_as_the_distortion_bends_them() -> None:
@@ -151,7 +154,7 @@ def test_spots_are_bent_as_the_distortion_bends_them() -> None:
     posterior = Posterior(
         model, simulate(model, theta, BACKGROUND, seed=1) + simulate(star, theta, 0.0, seed=2)
     )
-    found = clip(posterior, np.append(theta, BACKGROUND))
+    found = reject_once(posterior, np.append(theta, BACKGROUND))
     noise = found.posterior.sigma(np.append(theta, BACKGROUND))
     light = star.expected_counts(theta) / noise
     assert light[found.posterior.mask].max() < 0.5 and not found.missing.any()
@@ -168,7 +171,7 @@ def test_dead_pixels_are_masked() -> None:
     counts = posterior.counts.copy()
     counts[108:113, 108:113] = 0.0  # the star in the middle, half of it
     dead = Posterior(posterior.model, counts)
-    found = clip(dead, truth)
+    found = reject_once(dead, truth)
     assert found.missing[40] or not found.posterior.mask[108:113, 108:113].any()
     assert found.missing.sum() <= 1
 
@@ -176,22 +179,22 @@ def test_dead_pixels_are_masked() -> None:
 def test_wrong_parameters_are_not_blamed_on_the_catalogue() -> None:
     posterior, truth, *_ = frame(1)
     elsewhere = Posterior(posterior.model, np.roll(posterior.counts, 10, axis=1))  # half a spacing
-    assert clip(elsewhere, truth, (0.0, 0.3)).posterior is elsewhere
-    assert clip(elsewhere, truth).missing.sum() < 10
+    assert reject_once(elsewhere, truth, (0.0, 0.3)).posterior is elsewhere
+    assert reject_once(elsewhere, truth).missing.sum() < 10
     # half a PSF's width off, bright stars stand out as much as foreign spots, but for a tolerance
     shifted = Posterior(posterior.model, np.roll(posterior.counts, 1, axis=1))
-    assert clip(shifted, truth, (0.0,)).posterior is shifted
-    assert 8 <= clip(shifted, truth).missing.sum() < 20
+    assert reject_once(shifted, truth, (0.0,)).posterior is shifted
+    assert 8 <= reject_once(shifted, truth).missing.sum() < 20
     # where no pixel would be left, none is left out
     few = np.zeros(posterior.counts.shape, bool)
     few[100:103, 100:103] = True
     bright = Posterior(posterior.model, np.where(few, 1e4, 0.0), mask=few)
-    assert clip(bright, truth).posterior is bright
+    assert reject_once(bright, truth).posterior is bright
 
 
 def test_free_fluxes_fall_where_a_source_is_missing() -> None:
     posterior, truth, missing, spots = frame(1, nuisances=Nuisances("free"))
-    found = clip(posterior, truth)
+    found = reject_once(posterior, truth)
     column, row = pixels(posterior, spots)
     assert not found.posterior.mask[row, column].any()
     s = (
@@ -205,7 +208,7 @@ def test_free_fluxes_fall_where_a_source_is_missing() -> None:
     assert posterior.fluxes(truth)[missing].max() < 0.5 * FLUX
 
 
-def test_masked_pixels_hold_nothing_to_clip() -> None:
+def test_masked_pixels_hold_nothing_to_reject() -> None:
     posterior, truth, missing, spots = frame(1)
     v, u = np.indices(posterior.counts.shape) - 0.5 * (posterior.counts.shape[0] - 1)
     s = posterior.model.sources
@@ -214,7 +217,7 @@ def test_masked_pixels_hold_nothing_to_clip() -> None:
         mask &= (u - x) ** 2 + (v - y) ** 2 > 12.0**2
     counts = np.where(mask, posterior.counts, 1e6)
     masked = Posterior(posterior.model, counts, mask=mask)
-    assert clip(masked, truth).posterior is masked
+    assert reject_once(masked, truth).posterior is masked
     clipped, estimate = reject_outliers(masked)
     assert clipped is masked and "left out" not in estimate.message
 
@@ -241,7 +244,7 @@ def test_error_bars_hold_where_a_tenth_is_missing_and_a_tenth_foreign() -> None:
         squares.append(square(truth, estimate) / truth.size)
         whole.append(find_map(posterior, truth))
     assert abs(np.mean(squares) - 1.0) < 4.0 * 0.065
-    # negative control: of the whole posterior, though it is climbed from the truth, none fits
+    # negative control: of the whole posterior, though the search begins at the truth, none fits
     assert not any(estimate.at_maximum and estimate.fits_data for estimate in whole)
     assert (
         sum(
@@ -262,5 +265,5 @@ def test_the_same_is_left_out_wherever_the_search_begins(seed: int) -> None:
     # climb
     off = truth.copy()
     off[: COMPLETE.n_terms] += 0.01 * Field(posterior).scale
-    assert not np.array_equal(clip(posterior, off).posterior.mask, mine.mask)
-    assert np.array_equal(settle(posterior, off)[0].missing, clip(posterior, truth).missing)
+    assert not np.array_equal(reject_once(posterior, off).posterior.mask, mine.mask)
+    assert np.array_equal(reject(posterior, off)[0].missing, reject_once(posterior, truth).missing)

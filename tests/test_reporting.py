@@ -1,4 +1,4 @@
-"""The page and its figures: what they say, that they stand alone, that nothing a user writes is markup."""
+"""The page, its figures and its tables: what they say, and that nothing a user writes is markup."""
 
 import base64
 import re
@@ -22,9 +22,13 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model.posterior import Nuisances
-from bayesfred.reporting import plots
-from bayesfred.reporting.html import write_report
+from bayesfred.model.parameters import Nuisances, Parameter
+from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.html import page_figures, write_report
+from bayesfred.reporting.labels import axis_label
+from bayesfred.reporting.posteriors import corner_plot, overview, trace_plot
+from bayesfred.reporting.screen import parameter_table
+from bayesfred.sampling.summary import summary
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +37,7 @@ BACKGROUND = 5.0
 
 
 def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
-    """A chain of independent draws around the truth and its posterior: the attributes the report reads."""
+    """A chain of independent draws around the truth, and its posterior, as far as the report reads."""
     rng = np.random.default_rng(1)
     distortion = PolynomialDistortion(((1, 0, 1, 0), (2, 0, 1, 0)), ((0, 1, 0, 1), (0, 2, 0, 1)))
     model = ForwardModel(
@@ -58,6 +62,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         expected_counts=lambda params: model.expected_counts(params[:4], params[4]),
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
     )
+    posterior.parameters = parameters(posterior)
     estimate = SimpleNamespace(
         params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9
     )
@@ -115,13 +120,19 @@ class Page(HTMLParser):
         self.text += data
 
 
-def report(tmp_path: Path, **changes: Any) -> tuple[str, Page]:
-    chain, posterior = run()
+def fitted(posterior: Any, params: Floats) -> FittedFrame:
+    return FittedFrame.at(posterior, params)
+
+
+def report(tmp_path: Path, *, truth: Floats | None = None, **changes: Any) -> tuple[str, Page]:
+    """A page, without figures unless they are given."""
+    chain = changes.get("chain") or run()[0]
+    diagnostics = changes.get("diagnostics") or diagnose(chain, target_ess=500.0)
     fields = {
         "title": "A frame",
         "chain": chain,
-        "diagnostics": diagnose(chain, target_ess=500.0),
-        "posterior": posterior,
+        "summary": summary(chain, truth=truth, columns=diagnostics.columns),
+        "diagnostics": diagnostics,
     }
     path = write_report(tmp_path / "report.html", **(fields | changes))
     text = path.read_text(encoding="utf-8")
@@ -129,7 +140,10 @@ def report(tmp_path: Path, **changes: Any) -> tuple[str, Page]:
 
 
 def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
-    text, page = report(tmp_path, truth=np.append(TRUTH, BACKGROUND))
+    chain, posterior = run()
+    truth = np.append(TRUTH, BACKGROUND)
+    figures = page_figures(fitted(posterior, chain.estimate.params), chain, truth=truth)
+    text, page = report(tmp_path, truth=truth, chain=chain, figures=figures)
     assert not page.open
     assert "script" not in page.tags and "link" not in page.tags
     assert len(page.links) == 4 and all(
@@ -143,17 +157,19 @@ def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
 
 
 def test_page_says_what_it_must(tmp_path: Path) -> None:
-    _, page = report(
+    text, page = report(
         tmp_path,
         truth=np.append(TRUTH, BACKGROUND),
         notes=["Seen at dusk."],
         settings='{"seed": 7}',
     )
-    for words in ("converged: R-hat at "
-                  "most", "truth", "ESS bulk", "Pearson", "Deviance", "Seen at dusk.",
-                  '{"seed": 7}', "numpy 2.0", "4 ensembles of 32 walkers", "chains/a & b.h5",
-                  "Prior-dominated: none."):  # fmt: skip
+    for words in (
+        "trustworthy: The model fits the counts", "Sampled well: R-hat at most", "truth",
+        "ESS bulk", "Pearson", "Deviance", "Seen at dusk.", '{"seed": 7}', "numpy 2.0",
+        "4 ensembles of 32 walkers", "chains/a & b.h5", "Prior-dominated: none.",
+    ):  # fmt: skip
         assert words in page.text
+    assert 'class="verdict good"' in text
     # uncertainty to two digits, value to the same place, in one power of ten
     assert re.search(r"10−6 px−1\s+3\.00\s+3\.00\s+(3\.0\d|2\.9\d)\s+0\.12\s", page.text)
     assert re.search(r"background\s+counts\s+5\.000\s+5\.000\s+[45]\.\d{3}\s+0\.03\d\s", page.text)
@@ -164,7 +180,7 @@ def test_page_names_what_the_prior_dominates(tmp_path: Path) -> None:
     prior = norm(TRUTH[1] - 2e-7, 2e-7)
     posterior.log_prior = lambda draws: prior.logpdf(draws[:, 1])
     diagnostics = diagnose(chain)
-    _, page = report(tmp_path, diagnostics=diagnostics)
+    _, page = report(tmp_path, chain=chain, diagnostics=diagnostics)
     assert diagnostics.prior_dominated == (chain.parameter_names[1],)
     assert "Prior-dominated: fux2." in page.text
     assert f"{diagnostics.prior_sensitivity[chain.parameter_names[1]]:.3f}" in page.text
@@ -172,30 +188,32 @@ def test_page_names_what_the_prior_dominates(tmp_path: Path) -> None:
 
 def test_page_without_truth_or_notes(tmp_path: Path) -> None:
     _, page = report(tmp_path)
-    assert "truth" not in page.text and "Notes" not in page.text and "Settings" not in page.text
+    assert "truth" not in page.text.split("Parameters")[1]
+    assert "Notes" not in page.text and "Settings" not in page.text
 
 
-def test_page_of_an_unconverged_chain_says_why(tmp_path: Path) -> None:
+def test_page_of_a_badly_sampled_chain_says_why(tmp_path: Path) -> None:
     chain, _ = run()
     chain.chain[0] += 1e-7
-    text, page = report(tmp_path, chain=chain, diagnostics=diagnose(chain))
-    assert "not converged: R-hat" in page.text and 'class="verdict bad"' in text
+    text, page = report(tmp_path, chain=chain)
+    assert "not trustworthy: The model fits" in page.text and 'class="verdict bad"' in text
+    assert "Not sampled well: R-hat" in page.text
+
+
+def test_page_of_a_misfit_says_so_first(tmp_path: Path) -> None:
+    chain, posterior = run()
+    posterior.counts[8:12, 6:10] += 30.0
+    text, page = report(tmp_path, chain=chain)
+    assert "not trustworthy: The model does not fit the counts" in page.text
+    assert "Sampled well: R-hat" in page.text and 'class="verdict bad"' in text
 
 
 def test_everything_a_user_writes_is_escaped(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
-    chain, posterior = run((evil,))
+    chain, _ = run((evil,))
     chain.versions[evil] = evil
     chain.path = Path(evil)
-    text, page = report(
-        tmp_path,
-        title=evil,
-        chain=chain,
-        posterior=posterior,
-        diagnostics=diagnose(chain),
-        notes=[evil],
-        settings=evil,
-    )
+    text, page = report(tmp_path, title=evil, chain=chain, notes=[evil], settings=evil)
     assert "<script" not in text
     assert page.text.count(evil) >= 6
     assert "script" not in page.tags
@@ -214,6 +232,55 @@ def test_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.Mo
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
+# --- the table of parameters ----------------------------------------------------------------------
+
+
+def shown(table: Any) -> list[list[str]]:
+    """The cells of a table for the terminal, row by row."""
+    return [list(row) for row in zip(*(column.cells for column in table.columns), strict=True)]
+
+
+def test_screen_page_and_summary_show_the_same_numbers(tmp_path: Path) -> None:
+    """Every number of the summary, to the digits that are shown, is on the screen and the page."""
+    chain, _ = run()
+    truth = np.append(TRUTH, BACKGROUND) + 1e-8
+    diagnostics = diagnose(chain)
+    table = summary(chain, truth=truth, columns=diagnostics.columns)
+    # the numbers themselves
+    draws = chain.draws()
+    np.testing.assert_array_equal(table["mean"], draws.mean(axis=0))
+    np.testing.assert_array_equal(table["sd"], draws.std(axis=0, ddof=1))
+    np.testing.assert_allclose(table["z"], (table["mean"] - truth) / table["sd"])
+    assert table["name"].tolist() == list(chain.parameter_names)
+    assert table["unit"].tolist() == ["px^-1", "px^-2", "px^-1", "px^-2", "counts"]
+
+    _, page = report(tmp_path, truth=truth, chain=chain, diagnostics=diagnostics)
+    body = page.text.replace("−", "-")
+    rows = zip(table, shown(parameter_table(table)), strict=True)
+    for values, (name, true, estimate, posterior, z, rhat, ess, prior) in rows:
+        assert name == values["name"]
+        mean, _, sd, *power = posterior.split()
+        scale = float(f"1{power[0]}" if power else 1)
+        for cell, key in ((true, "truth"), (estimate, "MAP"), (mean, "mean"), (sd, "sd")):
+            number = cell.split()[0]
+            assert abs(float(number) * scale - values[key]) <= 0.06 * values["sd"], key
+            assert f" {number} " in f" {body} "
+        assert float(z) == pytest.approx(values["z"], abs=0.006) and f" {z} " in body
+        assert float(rhat) == pytest.approx(values["rhat"], abs=6e-4)
+        assert float(ess) == round(min(values["ess_bulk"], values["ess_tail"])) and ess in body
+        assert float(prior) == pytest.approx(values["prior_sensitivity"], abs=6e-4)
+        assert f" {prior} " in body
+
+
+def test_summary_of_a_chain_computes_what_diagnose_says() -> None:
+    chain, _ = run()
+    diagnostics = diagnose(chain)
+    table = summary(chain)
+    assert table.colnames == ["name", "unit", "MAP", "mean", "sd", "rhat", "ess_bulk", "ess_tail"]
+    for key in ("rhat", "ess_bulk", "ess_tail"):
+        assert table[key].tolist() == list(getattr(diagnostics, key).values())
+
+
 @pytest.mark.parametrize(
     ("name", "label"),
     [
@@ -226,14 +293,24 @@ def test_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.Mo
     ],
 )
 def test_labels_carry_power_and_unit(name: str, label: str) -> None:
-    assert plots._label(name, -6) == label
+    assert axis_label(described(name)[0], -6) == label
+
+
+def described(*names: str) -> tuple[Parameter, ...]:
+    return parameters(SimpleNamespace(parameter_names=names))
+
+
+# --- figures --------------------------------------------------------------------------------------
 
 
 def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:
     chain, _ = run()
     truth = np.append(TRUTH, BACKGROUND)
-    figure = plots.corner_plot(
-        chain.draws(), chain.parameter_names, truth=truth, estimate=chain.estimate.params
+    figure = corner_plot(
+        chain.draws(),
+        described(*chain.parameter_names),
+        truth=truth,
+        estimate=chain.estimate.params,
     )
     assert len(figure.axes) == 25
     assert "10^{-6}" in figure.axes[-4].get_xlabel()
@@ -247,7 +324,7 @@ def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:
 
 def test_corner_of_a_parameter_that_never_moved() -> None:
     draws = np.column_stack([np.random.default_rng(2).normal(size=500), np.full(500, 3.0)])
-    assert pixels(plots.corner_plot(draws, ("f_ux", "background"))).std() > 0.01
+    assert pixels(corner_plot(draws, described("f_ux", "background"))).std() > 0.01
 
 
 @pytest.mark.parametrize("d", [1, 2, 3, 13])
@@ -258,7 +335,7 @@ def test_trace_has_a_panel_for_every_parameter(d: int) -> None:
         parameter_names=tuple(f"f_u{k + 1}x" for k in range(d)),
         burn_in=1,
     )
-    figure = plots.trace_plot(chain)
+    figure = trace_plot(chain, described(*chain.parameter_names))
     shown = [ax for ax in figure.axes if ax.get_visible()]
     assert len(shown) == 2 * d
     assert sum("f_{" in ax.get_ylabel() for ax in shown) == d
@@ -274,7 +351,7 @@ def test_triptych_axes_count_pixels_from_the_middle(shape: tuple[int, int]) -> N
     mask = np.zeros(shape, bool)
     mask[ny // 4 - 3 : ny // 4 + 4, nx // 4 - 3 : nx // 4 + 4] = True
     # not the root of the counts: the noise model's word is taken
-    figure = plots.frame_triptych(counts, expected, 2.0 * np.sqrt(expected), mask)
+    figure = frame_triptych(FittedFrame(counts, expected, 2.0 * np.sqrt(expected), mask))
     frame, model, residual = figure.axes[:3]
     for ax in (frame, model, residual):
         assert ax.get_xlim() == (-nx / 2, nx / 2) and ax.get_ylim() == (-ny / 2, ny / 2)
@@ -293,9 +370,9 @@ def test_star_panels_show_the_brightest_inside_the_frame() -> None:
     expected = np.ones((40, 60))
     expected[10, 20], expected[39, 59] = 100.0, 50.0
     u, v = np.array([20, 59, 5, 500, np.nan]) - 29.5, np.array([10, 39, 5, 0, 0]) - 19.5
-    figure = plots.star_panels(
-        expected + 3.0, expected, expected**0.5, np.ones(expected.shape, bool), u, v, half_width=3
-    )
+    everywhere = np.ones(expected.shape, bool)
+    frame = FittedFrame(expected + 3.0, expected, expected**0.5, everywhere)
+    figure = star_panels(frame, u, v, half_width=3)
     stamps = [
         ax for ax in figure.axes if ax.images and ax.get_xlabel() == "" and len(values(ax)) == 7
     ]
@@ -311,22 +388,24 @@ def test_star_panels_show_the_brightest_inside_the_frame() -> None:
 
 
 def test_star_panels_show_at_most_24_and_survive_none() -> None:
-    frame = np.ones((50, 50))
+    ones = np.ones((50, 50))
+    frame = FittedFrame(ones, ones, ones, ones > 0)
     rng = np.random.default_rng(5)
     u, v = rng.uniform(-20, 20, (2, 40))
-    many = plots.star_panels(frame, frame, frame, frame > 0, u, v, half_width=2)
+    many = star_panels(frame, u, v, half_width=2)
     assert sum(len(ax.texts) for ax in many.axes) == 24
-    none = plots.star_panels(frame, frame, frame, frame > 0, u + 100, v, half_width=2)
+    none = star_panels(frame, u + 100, v, half_width=2)
     assert "no source" in none.texts[0].get_text()
 
 
 @pytest.mark.parametrize("shape", [(1, 4000), (4000, 1), (1, 1)])
 def test_strips_of_a_frame_make_pictures_of_a_usual_size(shape: tuple[int, int]) -> None:
-    frame = np.full(shape, 4.0)
+    four = np.full(shape, 4.0)
+    frame = FittedFrame(four, four, four**0.5, four > 0)
     draws = np.random.default_rng(5).normal(size=(100, 2))
     for figure in (
-        plots.frame_triptych(frame, frame, frame**0.5, frame > 0),
-        plots.overview(frame, frame, frame**0.5, frame > 0, draws, ("f_ux", "background")),
+        frame_triptych(frame),
+        overview(frame, draws, described("f_ux", "background")),
     ):
         height, width, _ = pixels(figure).shape
         assert 0.1 < height / width < 1.2
@@ -336,16 +415,8 @@ def test_strips_of_a_frame_make_pictures_of_a_usual_size(shape: tuple[int, int])
 def test_overview_shows_frame_and_marginals(with_truth: bool) -> None:
     chain, posterior = run()
     truth = np.append(TRUTH, BACKGROUND) if with_truth else None
-    expected = posterior.expected_counts(chain.estimate.params)
-    figure = plots.overview(
-        posterior.counts,
-        expected,
-        expected**0.5,
-        posterior.mask,
-        chain.draws(),
-        chain.parameter_names,
-        truth=truth,
-    )
+    frame = fitted(posterior, chain.estimate.params)
+    figure = overview(frame, chain.draws(), posterior.parameters, truth=truth)
     marginals = next(ax for ax in figure.axes if "posterior mean" in ax.get_ylabel())
     assert len(marginals.get_xticks()) == (5 if with_truth else 4)
     pixels(figure)

@@ -1,4 +1,8 @@
-"""Accidents: kills, interrupts, full disks, other processes at the same file. The chain file is the old one or the new one."""
+"""Accidents: kills, interrupts, full disks, other processes at the same file.
+
+The chain file is the old one or the new one. The operating system's calls are patched, as a disk
+that fails cannot be injected otherwise; everything else is an argument.
+"""
 
 import contextlib
 import errno
@@ -22,17 +26,29 @@ import emcee
 import h5py
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from test_model import make_model, make_posterior, make_truth
-from test_sampling_chain import TOTAL, assert_same_file, draws_of, run
+from test_sampling_chain import (
+    TOTAL,
+    Floats,
+    assert_same_file,
+    draws_of,
+    interrupted,
+    run,
+    watched,
+)
+from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
-from bayesfred.io import atomic
+from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.io.lock import only_writer
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
-from bayesfred.sampling import chainfile, sampler
-from bayesfred.sampling.chainfile import Chain, open_chain, random_states, write_chain
+from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import open_chain, write_chain
+from bayesfred.sampling.checkpoints import Checkpoints
+from bayesfred.sampling.sampler import Run
 
 HERE = Path(__file__).parent
 
@@ -77,21 +93,23 @@ class KilledError(BaseException):
 
 
 class Disk:
-    """The operations of a checkpoint; the one numbered `last` fails, and after a kill so do all that follow."""
+    """The operations of a checkpoint, of which the one numbered `last` fails.
 
-    def __init__(
-        self, patch: pytest.MonkeyPatch, error: BaseException | None = None, last: int = 10**9
-    ) -> None:
+    After a kill all that follow fail, too.
+    """
+
+    def __init__(self, error: BaseException | None = None, last: int = 10**9) -> None:
         self.error, self.last, self.done = error, last, list[str]()
-        real_open = open
+        self.patch = pytest.MonkeyPatch()
+
+    def __enter__(self) -> None:
+        create = self.watched("create", open)
         for name in ("fsync", "replace", "open", "unlink"):
-            patch.setattr(os, name, self.watched(name, getattr(os, name)))
-        patch.setattr(
-            atomic,
-            "open",
-            lambda *args: Stream(self, self.watched("create", real_open)(*args)),
-            raising=False,
-        )
+            self.patch.setattr(os, name, self.watched(name, getattr(os, name)))
+        self.patch.setattr("builtins.open", lambda *args: Stream(self, create(*args)))
+
+    def __exit__(self, *_: object) -> None:
+        self.patch.undo()
 
     def happen(self, name: str) -> None:
         if len(self.done) >= self.last and (
@@ -139,15 +157,31 @@ class Stream:
 OPERATIONS = ["unlink", "create", "write", "write", "flush", "fsync", "replace", "open", "fsync"]
 
 
-def test_a_checkpoint_reaches_the_disk_before_it_replaces_the_file(
-    posterior: Posterior, new: Chain, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    states, moved = random_states(new.path), replace(new, path=path)
-    with monkeypatch.context() as patch:
-        disk = Disk(patch)
-        write_chain(moved, posterior, states)
+def test_a_checkpoint_reaches_the_disk_before_it_replaces_the_file(new: Chain, path: Path) -> None:
+    disk = Disk()
+    with disk:
+        write_chain(replace(new, path=path))
     assert disk.done == OPERATIONS
     assert_same_file(path, new.path)
+
+
+def endangered(
+    write: Callable[[Chain], None], old: Chain, new: Chain, path: Path, disk: Disk
+) -> None:
+    """Write a chain to a disk that fails: the file is the old or the new one."""
+    error, moved = disk.error, replace(new, path=path)
+    expected = InputError if isinstance(error, OSError) else type(error)
+    with disk, pytest.raises(expected) as caught:
+        write(moved)
+    replaced = "replace" in disk.done
+    assert draws_of(open_chain(path)) == draws_of(new if replaced else old)
+    if isinstance(error, OSError):
+        assert "cannot be written (No space left on device)" in str(caught.value)
+    if not isinstance(error, KilledError):
+        assert [p.name for p in path.parent.iterdir()] == ["chain.h5"]
+    write(moved)  # what a killed run left does not disturb
+    assert_same_file(path, new.path)
+    assert [p.name for p in path.parent.iterdir()] == ["chain.h5"]
 
 
 @pytest.mark.parametrize("last", range(len(OPERATIONS)))
@@ -155,67 +189,55 @@ def test_a_checkpoint_reaches_the_disk_before_it_replaces_the_file(
     "error", [KilledError(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), KeyboardInterrupt()]
 )
 def test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state(
-    posterior: Posterior,
-    old: Chain,
-    new: Chain,
-    path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    last: int,
-    error: BaseException,
+    old: Chain, new: Chain, path: Path, last: int, error: BaseException
 ) -> None:
-    states, moved = random_states(new.path), replace(new, path=path)
-    expected = InputError if isinstance(error, OSError) else type(error)
-    with monkeypatch.context() as patch:
-        disk = Disk(patch, error, last)
-        with pytest.raises(expected) as caught:
-            write_chain(moved, posterior, states)
+    disk = Disk(error, last)
+    endangered(write_chain, old, new, path, disk)
     assert disk.done[:last] == OPERATIONS[:last]
-    replaced = last > OPERATIONS.index("replace")
-    assert draws_of(open_chain(path)) == draws_of(new if replaced else old)
-    if isinstance(error, OSError):
-        assert "cannot be written (No space left on device)" in str(caught.value)
-    if not isinstance(error, KilledError):
-        assert [p.name for p in path.parent.iterdir()] == ["chain.h5"]
-    write_chain(moved, posterior, states)  # what a killed run left is in nobody's way
-    assert_same_file(path, new.path)
-    assert [p.name for p in path.parent.iterdir()] == ["chain.h5"]
 
 
 def test_a_checkpoint_that_is_not_atomic_fails_that_test(
-    posterior: Posterior, old: Chain, new: Chain, path: Path, monkeypatch: pytest.MonkeyPatch
+    old: Chain, new: Chain, path: Path
 ) -> None:
-    def in_place(target: Path, *content: bytes, sole_writer: bool) -> None:
-        target.unlink()
-        with atomic.open(target, "xb") as stream:  # type: ignore[attr-defined]
-            stream.write(content[0])
+    content = new.path.read_bytes()
 
-    monkeypatch.setattr(chainfile, "replace", in_place)
-    test_every_prefix = test_every_prefix_of_a_checkpoint_is_the_old_or_the_new_state
+    def in_place(chain: Chain) -> None:
+        assert chain.path is not None
+        chain.path.unlink()
+        with open(chain.path, "xb") as stream:
+            stream.write(content)
+
+    disk = Disk(KilledError(), 2)  # halfway through its one write
     with pytest.raises(InputError, match="no seal"):
-        test_every_prefix(
-            posterior, old, new, path, monkeypatch, 2, KilledError()
-        )  # halfway through its one write
+        endangered(in_place, old, new, path, disk)
+    assert disk.done == ["unlink", "create", "failed"]
 
 
 # --- kills ----------------------------------------------------------------------------------------
 
 
 def sample_without_end(path: Path, pipe: int) -> None:
-    """Sample with a checkpoint after every step, and tell a pipe how many steps there are once they are saved."""
-    write = sampler.write_chain
+    """Sample with a checkpoint after every step, and tell a pipe how many steps were saved."""
 
-    def acknowledged(chain: Chain, *args: Any) -> None:
-        write(chain, *args)
+    def acknowledged(chain: Chain) -> None:
+        write_chain(replace(chain, path=path))
         os.write(pipe, f"{chain.chain.shape[1]}\n".encode())
 
-    sampler.CHECKPOINT, sampler.CHECKPOINT_SHARE = 0.0, np.inf
-    sampler.write_chain = acknowledged
-    with contextlib.redirect_stdout(None):
-        run(open_chain(path).posterior(), None, path, 10**6, resume=True)
+    chain = open_chain(path)
+    with only_writer(path), threadpool_limits(1, user_api="blas"):
+        Run.resumed(chain.posterior(), chain).until(1000.0, 10**6, often(acknowledged), show=False)
+
+
+def often(write: Callable[[Chain], None]) -> Checkpoints:
+    """A checkpoint after every step."""
+    return Checkpoints(write, interval=0.0, share=np.inf)
 
 
 def kill_often(path: Path, kills: int, seed: int) -> None:
-    """Kill a sampling process again and again, and print what was found; called in a process that has no threads yet."""
+    """Kill a sampling process again and again, and print what was found.
+
+    It is called in a process that has no threads yet.
+    """
     chance, found = random.Random(seed), {"unreadable": 0, "lost": 0, "reset": 0, "halfway": 0}
     temporary = path.with_name(f".{path.name}.tmp")
     for k in range(kills):
@@ -277,37 +299,32 @@ def test_kills_lose_nothing(
 # --- interrupts -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("protected", [True, False])
+class Unprotected(Checkpoints):
+    """Checkpoints that an interrupt stops halfway."""
+
+    def save(self, chain: Chain) -> None:
+        self.write(chain)
+
+
+@pytest.mark.parametrize("kind", [Checkpoints, Unprotected])
 def test_an_interrupt_while_saving_waits(
     posterior: Posterior,
     estimate: MapEstimate,
     old: Chain,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    protected: bool,
+    kind: type[Checkpoints],
 ) -> None:
-    """A Ctrl-C, and another while the steps are saved; without the protection the steps are lost."""
-    path, left, real = tmp_path / "chain.h5", 16, Posterior.log_prob
+    """A Ctrl-C, and another while the steps are saved; without the protection they are lost."""
+    path = tmp_path / "chain.h5"
 
-    def stop(self: Posterior, params: Any) -> Any:
-        nonlocal left
-        left -= 1
-        if left == 0:
-            raise KeyboardInterrupt
-        return real(self, params)
-
-    def impatient(*args: Any) -> None:
+    def impatient(chain: Chain) -> None:
         signal.raise_signal(signal.SIGINT)
-        write_chain(*args)
+        write_chain(replace(chain, path=path, density=posterior))
 
-    monkeypatch.setattr(Posterior, "log_prob", stop)
-    monkeypatch.setattr(sampler, "write_chain", impatient)
-    if not protected:
-        monkeypatch.setattr(sampler, "_unbroken", contextlib.nullcontext)
     with pytest.raises(KeyboardInterrupt):
-        run(posterior, estimate, path)
-    assert path.exists() == protected
-    if protected:
+        watched(posterior, estimate, path, interrupted(15), checkpoints=kind(impatient))
+    assert path.exists() == (kind is Checkpoints)
+    if kind is Checkpoints:
         assert np.array_equal(open_chain(path).chain, old.chain[:, :6])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -325,32 +342,23 @@ def test_sampling_in_a_thread_takes_no_signals(
 
 
 def test_checkpoints_keep_to_their_share(
-    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
 ) -> None:
-    """On a clock on which a step takes 10 and a checkpoint 7: one every 700, never more often than every 30."""
+    """On a clock on which a step takes 10 and a checkpoint 7: one every 700, the first after 30."""
     now, saved = 0.0, []
 
-    class Clock:
-        @staticmethod
-        def monotonic() -> float:
-            return now
-
-    def save(chain: Chain, *_: Any) -> None:
+    def save(chain: Chain) -> None:
         nonlocal now
         saved.append(now)
         now += 7.0
 
-    real = Posterior.log_prob
-
-    def step(self: Posterior, params: Any) -> Any:
+    def step(log_prob: Callable[[ArrayLike], Floats], params: ArrayLike) -> Floats:
         nonlocal now
         now += 5.0  # 2 ensembles, which seldom make more than a call each
-        return real(self, params)
+        return log_prob(params)
 
-    monkeypatch.setattr(sampler, "time", Clock)
-    monkeypatch.setattr(sampler, "write_chain", save)
-    monkeypatch.setattr(Posterior, "log_prob", step)
-    run(posterior, estimate, tmp_path / "chain.h5", 160)
+    checkpoints = Checkpoints(save, clock=lambda: now)
+    watched(posterior, estimate, tmp_path / "chain.h5", step, 160, checkpoints)
     assert len(saved) == 4 and 30.0 <= saved[0] < 70.0
     assert np.all(np.diff(saved[:-1]) >= 700.0)
 
@@ -380,21 +388,19 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_full_disk_says_so_and_loses_nothing(
-    posterior: Posterior,
-    estimate: MapEstimate,
-    small_disk: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    posterior: Posterior, estimate: MapEstimate, small_disk: Path, tmp_path: Path
 ) -> None:
     path = small_disk / "chain.h5"
-    with monkeypatch.context() as patch:
-        patch.setattr(sampler, "CHECKPOINT", 0.0)
-        patch.setattr(sampler, "CHECKPOINT_SHARE", np.inf)
-        with pytest.raises(
+    checkpoints = often(lambda chain: write_chain(replace(chain, path=path)))
+    running = Run(posterior, estimate, 1, ensembles=4, walkers=64)
+    with (
+        threadpool_limits(1, user_api="blas"),
+        pytest.raises(
             InputError,
-            match=r"cannot be written \(No space left on device\), expected a disk with room",
-        ):
-            big(posterior, estimate, path, 200)
+            match=r"cannot be written \(No space left on device\), expected room on the disk",
+        ),
+    ):
+        running.until(1000.0, 200, checkpoints, show=False)
     steps = open_chain(path).chain.shape[1]
     assert 20 < steps < 120
     assert not list(small_disk.glob("*.tmp"))
@@ -433,10 +439,18 @@ def without_rights() -> Iterator[None]:
             os.seteuid(0)
 
 
-def test_a_read_only_folder_is_refused_before_the_work(
-    posterior: Posterior, old: Chain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sampler, "find_map", lambda _: pytest.fail("the maximum was searched for"))
+@pytest.fixture(scope="module")
+def hopeless() -> Posterior:
+    """A posterior whose maximum cannot be found: a search for it would end with that message."""
+    model = make_model(SourceCatalog.grid(3, 17.0, 1.0))
+    posterior = Posterior(model, np.full((60, 75), 100.0))
+    with pytest.raises(InputError, match="cannot determine"):
+        find_map(posterior)
+    return posterior
+
+
+def test_a_read_only_folder_is_refused_before_the_work(hopeless: Posterior, old: Chain) -> None:
+    refused = r"cannot be written \(Permission denied\), expected a folder that can"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.copy(old.path, folder)
@@ -448,11 +462,8 @@ def test_a_read_only_folder_is_refused_before_the_work(
                     ("chain.h5", {"overwrite": True}),
                     ("other.h5", {}),
                 ):
-                    with pytest.raises(
-                        InputError,
-                        match=r"cannot be written \(Permission denied\), expected a folder that can",
-                    ):
-                        run(posterior, None, folder / target, TOTAL + 1, **options)
+                    with pytest.raises(InputError, match=refused):
+                        run(hopeless, None, folder / target, TOTAL + 1, **options)
                 assert draws_of(open_chain(folder / "chain.h5")) == draws_of(old)
         finally:
             folder.chmod(0o755)
@@ -463,9 +474,8 @@ def test_a_read_only_folder_is_refused_before_the_work(
 
 
 def test_a_second_writer_hears_who_the_first_is_before_any_work(
-    posterior: Posterior, path: Path, monkeypatch: pytest.MonkeyPatch
+    hopeless: Posterior, path: Path
 ) -> None:
-    monkeypatch.setattr(sampler, "find_map", lambda _: pytest.fail("the maximum was searched for"))
     before = path.read_bytes()
     with only_writer(path):
         for options in ({"resume": True}, {"overwrite": True}, {}):
@@ -473,10 +483,10 @@ def test_a_second_writer_hears_who_the_first_is_before_any_work(
                 InputError,
                 match=rf"\(process {os.getpid()} on \S+ since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d\S+\)",
             ):
-                run(posterior, None, path, TOTAL + 1, **options)
+                run(hopeless, None, path, TOTAL + 1, **options)
         (path.parent / ".chain.h5.writer").write_bytes(b"\x1b[31mme\n\xff" + b"x" * 10**6)
         with pytest.raises(InputError) as caught:
-            run(posterior, None, path, TOTAL + 1, resume=True)
+            run(hopeless, None, path, TOTAL + 1, resume=True)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
     assert path.read_bytes() == before
 
@@ -507,18 +517,26 @@ def test_a_killed_writer_leaves_no_lock(
 
 
 def test_a_file_that_appeared_meanwhile_is_not_replaced(
-    posterior: Posterior, old: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hopeless: Posterior, old: Chain, tmp_path: Path
 ) -> None:
-    @contextlib.contextmanager
-    def waited(path: Path) -> Iterator[None]:
-        with only_writer(path):
-            shutil.copy(old.path, path)  # the other run has ended in the meantime
-            yield
+    """The other run ends while this one waits for the lock."""
+    path, said = tmp_path / "chain.h5", list[str]()
 
-    monkeypatch.setattr(sampler, "only_writer", waited)
-    with pytest.raises(InputError, match="exists, expected a new file"):
-        run(posterior, None, tmp_path / "chain.h5", 2)
-    assert (tmp_path / "chain.h5").read_bytes() == old.path.read_bytes()
+    def refused() -> None:
+        with pytest.raises(InputError) as caught:
+            run(hopeless, None, path, 2)
+        said.append(str(caught.value))
+
+    while not said or "another process is writing" in said[-1]:  # it did not wait long enough
+        path.unlink(missing_ok=True)
+        thread = threading.Thread(target=refused)
+        with only_writer(path):
+            thread.start()
+            time.sleep(0.05)
+            shutil.copy(old.path, path)
+        thread.join()
+    assert "exists, expected a new file" in said[-1]
+    assert path.read_bytes() == old.path.read_bytes()
 
 
 def attach(posterior: Posterior, path: Path, k: int) -> int:
@@ -543,15 +561,9 @@ def attach(posterior: Posterior, path: Path, k: int) -> int:
 
 @pytest.mark.parametrize("attaches", [60, pytest.param(1000, marks=pytest.mark.long)])
 def test_readers_and_attaches_disturb_nobody(
-    posterior: Posterior,
-    estimate: MapEstimate,
-    path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    attaches: int,
+    posterior: Posterior, estimate: MapEstimate, path: Path, attaches: int
 ) -> None:
     """A checkpoint after every step, a reader every 10 ms, and others that attach, in 4 threads."""
-    monkeypatch.setattr(sampler, "CHECKPOINT", 0.0)
-    monkeypatch.setattr(sampler, "CHECKPOINT_SHARE", np.inf)
     seen: list[int] = []
     errors: list[BaseException] = []
     waiting, attached = list(range(attaches)), list[int]()
@@ -574,34 +586,28 @@ def test_readers_and_attaches_disturb_nobody(
         while waiting and not stop.is_set():
             attached.append(attach(posterior, path, waiting.pop()))
 
-    real = Posterior.log_prob
-
-    def until_attached(self: Posterior, params: Any) -> Any:
+    def until_attached(log_prob: Callable[[ArrayLike], Floats], params: ArrayLike) -> Floats:
         if errors or (len(attached) == attaches and len(seen) > 5):
             raise KeyboardInterrupt
-        return real(self, params)
+        return log_prob(params)
 
-    monkeypatch.setattr(Posterior, "log_prob", until_attached)
     threads = [threading.Thread(target=guarded(work)) for work in (poll, *4 * [attach_often])]
     started = threading.Event()
-    write = sampler.write_chain
 
-    def begin(*args: Any) -> None:
-        write(*args)
+    def write(chain: Chain) -> None:
+        write_chain(replace(chain, path=path, density=posterior))
         if not started.is_set():
             started.set()
             for thread in threads:
                 thread.start()
 
-    monkeypatch.setattr(sampler, "write_chain", begin)
     try:
-        with pytest.raises(KeyboardInterrupt):
-            run(posterior, None, path, 10**5, resume=True)
+        with only_writer(path), pytest.raises(KeyboardInterrupt):
+            watched(posterior, estimate, path, until_attached, 10**5, often(write), resume=True)
     finally:
         stop.set()
         for thread in threads:
             thread.join()
-    monkeypatch.undo()
     assert errors == [] and len(attached) == attaches and min(attached) >= TOTAL
     assert seen == sorted(seen) and len(set(seen)) > 3
     steps = open_chain(path).chain.shape[1]

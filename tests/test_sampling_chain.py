@@ -1,9 +1,11 @@
 """Runs and their files: resuming, interrupts, damage, and what others can read of them."""
 
 import math
+import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +17,28 @@ import numba as nb
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 from test_model import EVERYTHING, make_model, make_posterior, make_truth
+from threadpoolctl import threadpool_limits
 
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.io import hdf5_checks
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
+from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
-from bayesfred.sampling import ensembles, sampler
-from bayesfred.sampling.chainfile import Chain, fingerprint, open_chain, random_states, write_chain
-from bayesfred.sampling.ensembles import adapted
-from bayesfred.sampling.sampler import burn_in, sample
+from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import fingerprint, open_chain, write_chain
+from bayesfred.sampling.checkpoints import Checkpoints, in_memory
+from bayesfred.sampling.convergence import convergence
+from bayesfred.sampling.ensembles import DE_SHARE, adapted, moves_after
+from bayesfred.sampling.sampler import Run, sample
+from bayesfred.sampling.stopping import checks, forgetting
 
 Floats = NDArray[np.float64]
 
@@ -64,6 +72,60 @@ def run(
         **options,
     }
     return sample(posterior, estimate, path=path, steps=steps, **settings)
+
+
+Through = Callable[[Callable[[ArrayLike], Floats], ArrayLike], Floats]
+
+
+class Watched(TargetDensity):
+    """A density whose `log_prob` is called by a function of the test."""
+
+    def __init__(self, real: TargetDensity, through: Through) -> None:
+        self.real, self.through = real, through
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return self.real.parameter_names
+
+    @property
+    def support(self) -> tuple[Floats, Floats]:
+        return self.real.support
+
+    def log_prob(self, params: ArrayLike) -> Floats:
+        return self.through(self.real.log_prob, params)
+
+    def gradient(self, params: ArrayLike) -> Floats:
+        return self.real.gradient(params)
+
+    def information(self, params: ArrayLike) -> Floats:
+        return self.real.information(params)
+
+
+def saving(posterior: Posterior, path: Path, **options: Any) -> Checkpoints:
+    """Checkpoints of a watched run, whose file holds the posterior itself."""
+    return Checkpoints(
+        lambda chain: write_chain(replace(chain, path=path, density=posterior)), **options
+    )
+
+
+def watched(
+    posterior: Posterior,
+    estimate: MapEstimate,
+    path: Path,
+    through: Through,
+    steps: int | None = TOTAL,
+    checkpoints: Checkpoints | None = None,
+    *,
+    resume: bool = False,
+) -> Chain:
+    """As `run`, with log-probabilities that a function of the test computes or spoils."""
+    target, checkpoints = Watched(posterior, through), checkpoints or saving(posterior, path)
+    with threadpool_limits(1, user_api="blas"):
+        if resume:
+            running = Run.resumed(target, open_chain(path))
+        else:
+            running = Run(target, estimate, 1, ensembles=2, walkers=8)
+        return running.until(1000.0, steps, checkpoints, show=False)
 
 
 @pytest.fixture(scope="module")
@@ -147,15 +209,93 @@ def test_the_file_gives_the_chain_back(whole: Chain) -> None:
         whole.seed,
     )
     assert again.versions == whole.versions and again.estimate.message == whole.estimate.message
-    tree = again.to_datatree()
-    shape = (2 * 8, TOTAL - again.burn_in)
+    assert fingerprint(again.posterior()) == fingerprint(whole.posterior())
+    assert again.random_states[1][1].tolist() == whole.random_states[1][1].tolist()
+
+
+def test_a_chain_holds_the_posterior_that_was_sampled(
+    posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path
+) -> None:
+    """Whatever file takes the place of the chain's, and where none is left."""
+    path = Path(shutil.copy(whole.path, tmp_path))
+    chain = open_chain(path)
+    other = Posterior(posterior.model, posterior.counts + 1.0)
+    replacing = run(other, estimate, path, 2, overwrite=True)
+    before, after = (fingerprint(p) for p in (posterior, other))
+    assert before["counts"] != after["counts"]
+    assert fingerprint(chain.posterior()) == before and chain.posterior() is chain.posterior()
+    assert fingerprint(replacing.posterior()) == after  # negative control: the file did change
+    assert fingerprint(open_chain(path).posterior()) == after
+    path.unlink()
+    assert fingerprint(chain.posterior()) == before
+
+
+def test_the_seal_is_checked_once(whole: Chain, tmp_path: Path) -> None:
+    """A pipe can be read once: the chain, its posterior and its random numbers come with it."""
+    chain = open_chain(whole.path)
+    assert chain.posterior() is not whole.posterior() and chain.random_states
+    chain.path.rename(moved := tmp_path / "moved.h5")
+    try:
+        resumed = Run.resumed(chain.posterior(), chain)
+        assert resumed.steps[-1].random[0][1].tolist() == whole.random_states[0][1].tolist()
+        assert chain.posterior().log_prob(chain.estimate.params) == chain.estimate.log_prob
+    finally:
+        moved.rename(whole.path)
+
+
+def test_sampling_in_memory_is_sampling_to_a_file(
+    posterior: Posterior, estimate: MapEstimate, whole: Chain, tmp_path: Path
+) -> None:
+    settings: dict[str, Any] = {"seed": 1, "ensembles": 2, "walkers": 8, "progress": False}
+    before = os.getcwd()
+    os.chdir(tmp_path)
+    try:
+        chain = sample(posterior, estimate, steps=TOTAL, **settings)
+    finally:
+        os.chdir(before)
+    assert draws_of(chain) == draws_of(whole) and chain.burn_in == whole.burn_in
+    assert chain.path is None and chain.posterior() is posterior
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="sampling: path: got none with resume or overwrite"):
+        sample(posterior, estimate, resume=True, **settings)
+
+
+def test_a_density_that_no_file_can_hold_is_refused_before_sampling(
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
+) -> None:
+    def never(log_prob: Any, params: ArrayLike) -> Floats:
+        raise AssertionError("it was evaluated")
+
+    with pytest.raises(InputError, match="files cannot hold, .* or sample it in memory"):
+        sample(Watched(posterior, never), path=tmp_path / "chain.h5", seed=1, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_ensemble_is_a_chain_for_arviz(whole: Chain) -> None:
+    tree = whole.to_datatree()
+    shape = (2, 8 * (TOTAL - whole.burn_in))
     assert tree["posterior"]["background"].shape == tree["sample_stats"]["lp"].shape == shape
-    assert np.array_equal(
-        tree["posterior"]["f_ux"].values[8], again.chain[1, again.burn_in :, 0, 0]
-    )
-    assert np.array_equal(
-        tree["sample_stats"]["lp"].values[9], again.log_prob[1, again.burn_in :, 1]
-    )
+    second = whole.burn_in + 1  # of the steps that are kept: after the 8 walkers' first ones
+    for name, k in (("f_ux", 0), ("background", 12)):
+        assert np.array_equal(tree["posterior"][name].values[1, 8:16], whole.chain[1, second, :, k])
+    assert np.array_equal(tree["sample_stats"]["lp"].values[1, 8:16], whole.log_prob[1, second])
+    rhat = convergence(whole.chain[:, whole.burn_in :])[0]
+    theirs = arviz_stats.rhat(tree)
+    for name, ours in zip(whole.parameter_names, rhat, strict=True):
+        assert float(theirs[name]) == pytest.approx(ours, rel=1e-6)
+
+
+def test_what_arviz_assumes_of_draws_is_what_the_documentation_says(whole: Chain) -> None:
+    """Steps of correlation 0.9: 1000 steps of 128 walkers have 1000 x 128 x 0.1 / 1.9 = 6737."""
+    rng = np.random.default_rng(1)
+    steps = np.empty((4, 1000, 32, 13))
+    steps[:, 0] = rng.standard_normal((4, 32, 13))
+    for n in range(1, 1000):
+        steps[:, n] = 0.9 * steps[:, n - 1] + 0.19**0.5 * rng.standard_normal((4, 32, 13))
+    long = replace(whole, chain=steps, log_prob=steps[..., 0], burn_in=0)
+    ess = float(arviz_stats.ess(long.to_datatree())["f_ux"])
+    assert convergence(steps[..., :1])[1][0] == pytest.approx(6737, rel=0.1)
+    assert 15 < ess / 6737 < 21
 
 
 def test_emcee_reads_the_file(whole: Chain) -> None:
@@ -387,40 +527,47 @@ def test_an_estimate_off_the_posterior_is_refused(
 CALLS_OF_A_STEP = 2  # one an ensemble, before the first look
 
 
-def spoilt(monkeypatch: pytest.MonkeyPatch, bad: Mapping[int, float], first: int = 2) -> None:
-    """Make the first walker's log-probability something else in the given calls after the walkers are placed."""
-    real, call = Posterior.log_prob, -first
+def spoilt(bad: Mapping[int, float], first: int = 2) -> Through:
+    """The first walker's log-probability is something else in the given calls.
 
-    def spoil(self: Posterior, params: Any) -> Any:
+    They are counted after `first` calls, which place the walkers.
+    """
+    call = -first
+
+    def spoil(log_prob: Callable[[ArrayLike], Floats], params: ArrayLike) -> Floats:
         nonlocal call
-        values = real(self, params)
+        values = log_prob(params)
         if call in bad:
             values[0] = bad[call]
         call += 1
         return values
 
-    monkeypatch.setattr(Posterior, "log_prob", spoil)
+    return spoil
 
 
-@pytest.mark.parametrize("calls", [3, 4, 5, 11, 17])
-def test_an_interrupted_run_keeps_its_complete_steps(
-    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
-) -> None:
-    # 2 calls place the walkers, emcee evaluates none again, and before the first look a step is a
-    # call an ensemble
-    path, real, left = tmp_path / "chain.h5", Posterior.log_prob, calls
+def interrupted(calls: int) -> Through:
+    """A Ctrl-C after so many calls."""
+    left = calls
 
-    def interrupted(self: Posterior, params: Any) -> Any:
+    def through(log_prob: Callable[[ArrayLike], Floats], params: ArrayLike) -> Floats:
         nonlocal left
         left -= 1
         if left < 0:
             raise KeyboardInterrupt
-        return real(self, params)
+        return log_prob(params)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Posterior, "log_prob", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            run(posterior, whole.estimate, path)
+    return through
+
+
+@pytest.mark.parametrize("calls", [3, 4, 5, 11, 17])
+def test_an_interrupted_run_keeps_its_complete_steps(
+    posterior: Posterior, whole: Chain, tmp_path: Path, calls: int
+) -> None:
+    # 2 calls place the walkers, emcee evaluates none again, and before the first look a step is a
+    # call an ensemble
+    path = tmp_path / "chain.h5"
+    with pytest.raises(KeyboardInterrupt):
+        watched(posterior, whole.estimate, path, interrupted(calls))
     complete = (calls - 2) // 2
     assert path.exists() == (complete > 0)
     if complete:
@@ -435,30 +582,26 @@ def test_an_interrupted_run_keeps_its_complete_steps(
 
 
 def test_what_is_no_density_is_refused_and_counted(
-    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    posterior: Posterior, whole: Chain, tmp_path: Path
 ) -> None:
     bad = {3: math.nan, 7: math.inf, 8: math.nan, 20: math.inf, 21: -math.inf}
-    with monkeypatch.context() as patch:
-        spoilt(patch, bad)
-        chain = run(posterior, whole.estimate, tmp_path / "a.h5")
-    assert chain.n_invalid == open_chain(chain.path).n_invalid == 4 and whole.n_invalid == 0
+    a, b = tmp_path / "a.h5", tmp_path / "b.h5"
+    chain = watched(posterior, whole.estimate, a, spoilt(bad))
+    assert chain.n_invalid == open_chain(a).n_invalid == 4 and whole.n_invalid == 0
     assert np.isfinite(chain.log_prob).all() and np.isfinite(chain.chain).all()
     assert chain.accepted.sum() < whole.accepted.sum()
-    with monkeypatch.context() as patch:
-        spoilt(patch, bad)
-        run(posterior, whole.estimate, tmp_path / "b.h5", 5)
-    assert open_chain(tmp_path / "b.h5").n_invalid == 3
-    with monkeypatch.context() as patch:
-        spoilt(patch, bad, first=-5 * CALLS_OF_A_STEP)
-        assert draws_of(run(posterior, None, tmp_path / "b.h5", resume=True)) == draws_of(chain)
-    assert_same_file(tmp_path / "b.h5", chain.path)
+    watched(posterior, whole.estimate, b, spoilt(bad), 5)
+    assert open_chain(b).n_invalid == 3
+    rest = spoilt(bad, first=-5 * CALLS_OF_A_STEP)
+    assert draws_of(watched(posterior, whole.estimate, b, rest, resume=True)) == draws_of(chain)
+    assert_same_file(a, b)
 
 
 def test_walkers_start_where_there_is_density(
-    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    posterior: Posterior, whole: Chain, tmp_path: Path
 ) -> None:
-    spoilt(monkeypatch, {-2: math.inf, -1: math.nan})
-    chain = run(posterior, whole.estimate, tmp_path / "chain.h5", 1)
+    spoiling = spoilt({-2: math.inf, -1: math.nan})
+    chain = watched(posterior, whole.estimate, tmp_path / "chain.h5", spoiling, 1)
     assert chain.n_invalid == 2 and np.isfinite(chain.log_prob).all()
 
 
@@ -471,19 +614,21 @@ def test_an_infinite_prior_density_is_no_density(posterior: Posterior) -> None:
     assert infinite.log_prob(undistorted) == infinite.log_prob(undistorted[None])[0] == math.inf
 
 
+TINY = np.array([1.0] * 12 + [1e-20])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda e: {"params": np.where(np.arange(13) == 3, np.nan, e.params)}, "no density around "
-                                                                               "it"),
+        (lambda e: {"params": np.where(np.arange(13) == 3, np.nan, e.params)}, 
+         "no density around it"),
         (lambda e: {"params": e.params[:12]}, "got 12 parameters, expected 13"),
         (lambda e: {"covariance": -e.covariance}, "no positive definite covariance"),
         (lambda e: {"covariance": np.ones((13, 13))}, "no positive definite covariance"),
         (lambda e: {"covariance": np.nan * e.covariance}, "no positive definite covariance"),
         (lambda e: {"covariance": e.covariance[:12]}, "no positive definite covariance"),
-        (lambda e: {"covariance": e.covariance * np.where(np.eye(13)[12] > 0, 1e-40, 1.0)[:, None] ** 0.5
-                    * np.where(np.eye(13)[12] > 0, 1e-40, 1.0) ** 0.5}, "the same background for "
-                                                                        "all walkers"),
+        (lambda e: {"covariance": e.covariance * np.outer(TINY, TINY)},
+         "the same background for all walkers"),
     ],
 )  # fmt: skip
 def test_an_estimate_that_no_run_can_start_from_is_refused(
@@ -494,13 +639,11 @@ def test_an_estimate_that_no_run_can_start_from_is_refused(
     assert not (tmp_path / "chain.h5").exists()
 
 
-def spoil_last_step(
-    whole: Chain, path: Path, posterior: Posterior, name: str, values: Floats
-) -> None:
+def spoil_last_step(whole: Chain, path: Path, name: str, values: Floats) -> None:
     """A chain file whose last step has other walkers."""
     array = getattr(whole, name).copy()
     array[:, -1] = values
-    write_chain(replace(whole, path=path, **{name: array}), posterior, random_states(whole.path))
+    write_chain(replace(whole, path=path, **{name: array}))
 
 
 @pytest.mark.parametrize(
@@ -542,50 +685,46 @@ def test_a_run_that_cannot_go_on_is_refused(
     posterior: Posterior, whole: Chain, tmp_path: Path, name: str, change: Any, words: str
 ) -> None:
     path = tmp_path / "chain.h5"
-    spoil_last_step(whole, path, posterior, name, change(getattr(whole, name)[:, -1]))
+    spoil_last_step(whole, path, name, change(getattr(whole, name)[:, -1]))
     before = path.read_bytes()
     with pytest.raises(InputError, match=f"start: got .*{words}"):
         run(posterior, None, path, TOTAL + 1, resume=True)
     assert path.read_bytes() == before
 
 
-def test_a_stuck_walker_ends_the_run(
-    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One walker claims a density that no proposal has; the run says so, and what was sampled is there."""
-    monkeypatch.setattr(ensembles, "STUCK", 30)
+def test_a_stuck_walker_ends_the_run(posterior: Posterior, whole: Chain, tmp_path: Path) -> None:
+    """One walker claims a density that no proposal has; what was sampled is saved."""
     path = tmp_path / "chain.h5"
     spoil_last_step(
         whole,
         path,
-        posterior,
         "log_prob",
         whole.log_prob[:, -1] + np.array([[1e6] + 7 * [0.0], 8 * [0.0]]),
     )
-    with pytest.raises(InputError, match="1 of 16 walkers stuck, 30 steps without a move"):
-        run(posterior, None, path, 1000, resume=True)
+    with pytest.raises(InputError, match="1 of 16 walkers stuck, 1000 steps without a move"):
+        run(posterior, None, path, 2000, resume=True)
     kept = open_chain(path)
-    assert kept.chain.shape[1] == TOTAL + 30
+    assert kept.chain.shape[1] == TOTAL + 1000
     assert (
-        np.ptp(kept.chain[0, -31:, 0], axis=0).max()
+        np.ptp(kept.chain[0, -1001:, 0], axis=0).max()
         == 0.0
-        < np.ptp(kept.chain[:, -31:, 1], axis=1).min()
+        < np.ptp(kept.chain[:, -1001:, 1], axis=1).min()
     )
 
 
 def test_an_ensemble_that_accepts_nothing_ends_the_run(
-    posterior: Posterior, estimate: MapEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    posterior: Posterior, estimate: MapEstimate, tmp_path: Path
 ) -> None:
-    path, real, placed = tmp_path / "chain.h5", Posterior.log_prob, 2
+    path, placed = tmp_path / "chain.h5", 2
 
-    def nothing(self: Posterior, params: Any) -> Any:
+    def nothing(log_prob: Callable[[ArrayLike], Floats], params: ArrayLike) -> Floats:
         nonlocal placed
         placed -= 1
-        return real(self, params) if placed >= 0 else np.full(len(params), -np.inf)
+        return log_prob(params) if placed >= 0 else np.full(len(np.array(params)), -np.inf)
 
-    monkeypatch.setattr(Posterior, "log_prob", nothing)
     with pytest.raises(InputError, match="16 of 16 walkers stuck, 125 steps without a move"):
-        run(posterior, estimate, path, None)  # 125 steps of 8 walkers are 1000 proposals
+        # 125 steps of 8 walkers are 1000 proposals
+        watched(posterior, estimate, path, nothing, None)
     assert open_chain(path).chain.shape[1] == 125
 
 
@@ -694,22 +833,16 @@ def test_the_posterior_is_rebuilt(
 
 
 @pytest.mark.parametrize("effective", [0.0, 1e-15, 1e-3])
-def test_walkers_that_hardly_move_leave_half_the_run_out(
-    monkeypatch: pytest.MonkeyPatch, effective: float
-) -> None:
+def test_walkers_that_hardly_move_leave_half_the_run_out(effective: float) -> None:
     """However long the correlation is; 1/effective overflows no logarithm."""
-    monkeypatch.setattr(sampler, "bulk_sizes", lambda _: np.full(2, effective))
-    assert burn_in(np.random.default_rng(1).standard_normal((4, 80, 8, 2))) == 40
+    assert forgetting(80, effective, 2560) == 40
 
 
 @pytest.mark.parametrize(("tau", "left_out"), [(1.0, 0), (1.2, 1), (3.0, 4), (9.0, 13)])
-def test_the_first_step_that_is_kept_has_forgotten_the_start(
-    monkeypatch: pytest.MonkeyPatch, tau: float, left_out: int
-) -> None:
-    chain = np.random.default_rng(1).standard_normal((4, 80, 8, 2))
-    monkeypatch.setattr(sampler, "bulk_sizes", lambda kept: np.full(2, kept[..., 0].size / tau))
+def test_the_first_step_that_is_kept_has_forgotten_the_start(tau: float, left_out: int) -> None:
     r = (tau - 1.0) / (tau + 1.0)
-    assert burn_in(chain) == left_out and r ** (left_out + 1) <= 0.05 < max(r, 1e-9) ** left_out
+    assert forgetting(80, 2560 / tau, 2560) == left_out
+    assert r ** (left_out + 1) <= 0.05 < max(r, 1e-9) ** left_out
 
 
 def test_differential_evolution_begins_after_the_first_look(
@@ -718,14 +851,30 @@ def test_differential_evolution_begins_after_the_first_look(
     shares = [
         {
             type(move): share
-            for move, share in ensembles._moves(posterior, whole.estimate, whole.chain[:, :n])
+            for move, share in moves_after(posterior, whole.estimate, whole.chain[:, :n])
         }[emcee.moves.DEMove]
         for n in (0, 1, 7, 8, 12)
     ]
-    assert adapted(whole.chain) == 0 and shares == [
-        0.0,
-        0.0,
-        0.0,
-        ensembles.DE_SHARE,
-        ensembles.DE_SHARE,
-    ]
+    assert adapted(whole.chain) == 0 and shares == [0.0, 0.0, 0.0, DE_SHARE, DE_SHARE]
+
+
+def test_a_resumed_run_is_checked_after_the_same_steps(
+    posterior: Posterior, estimate: MapEstimate
+) -> None:
+    """Wherever it stopped, a check's own step included."""
+    due = list(islice(checks(), 8))
+    assert due == [8, 9, 10, 11, 12, 13, 14, 15]
+
+    def until(run: Run, steps: int | None) -> Chain:
+        with threadpool_limits(1, user_api="blas"):
+            return run.until(100.0, steps, in_memory(), show=False)
+
+    def fresh() -> Run:
+        return Run(posterior, estimate, 1, ensembles=2, walkers=8)
+
+    enough = until(fresh(), None)
+    last = enough.chain.shape[1]
+    assert last > 9
+    for stop in (1, 8, last - 1, last):
+        resumed = Run.resumed(posterior, until(fresh(), stop))
+        assert draws_of(until(resumed, None)) == draws_of(enough)

@@ -14,7 +14,7 @@ from test_model import LIMIT
 from bayesfred.commands import simulate_frame
 from bayesfred.io.frames import read_frame
 from bayesfred.model.posterior import Posterior
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.sampler import sample
 
 FOLDER = ROOT / "chains" / "reference"

@@ -26,7 +26,7 @@ from arviz_stats.base import array_stats
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
 
 __all__ = ["Comparison", "Score", "compare"]

@@ -1,6 +1,6 @@
-"""What a finished run is worth: did the chain converge, does the model fit the counts, and how much of it is the prior's.
+"""What a finished run is worth: is it sampled well, does it fit the counts, what is the prior's part.
 
-`diagnose` puts all into one record. Convergence is judged on R-hat, effective sample sizes,
+`diagnose` puts all into one record. Sampling is judged on R-hat, effective sample sizes,
 acceptance and the optimiser's own verdict (`bayesfred.sampling.convergence` holds the estimators).
 The fit is judged at the MAP by three sums over the pixels that enter the likelihood: the paper's
 normalised chi-square, Pearson's statistic and the deviance. The last two come with the expectation
@@ -18,16 +18,17 @@ time.
 """
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import arviz_base
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.fit_statistics import fit_statistics
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
@@ -36,6 +37,7 @@ MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
 FEWEST = 100  # draws from which a sensitivity is read
 FLAT = 1e-6  # difference of log densities that moves no posterior
+FIELD_POINTS = 9  # along each axis of the frame
 INFORMATIVE = 0.05  # sensitivity; the threshold of Kallioinen et al., and of arviz
 
 
@@ -45,10 +47,15 @@ class Diagnostics:
 
     Attributes
     ----------
-    converged : bool
-        Whether every criterion of `message` is met.
+    sampled_well : bool
+        Whether R-hat, effective sample sizes and acceptance are as they should be, and the MAP is
+        at the maximum. It says nothing of the model.
+    fits_data : bool
+        Whether the deviance is what the noise makes it, within 5 standard deviations. It says
+        nothing of the sampling.
     message : str
-        One line: the criteria and their values, or which ones failed.
+        One line: whether the run is trustworthy, how well the model fits, and how well it is
+        sampled, a sentence each.
     rhat : dict of str to float
         Rank-normalised split R-hat between ensembles, by parameter.
     ess_bulk, ess_tail : dict of str to float
@@ -79,10 +86,14 @@ class Diagnostics:
         power alpha: cumulative Jensen-Shannon distance per unit of log2(alpha) at alpha = 1. nan
         where draws are too few or do not vary.
     prior_dominated : tuple of str
-        Parameters whose prior sensitivity is at least 0.05: not the frame alone decides about them.
+        Parameters whose prior sensitivity is at least 0.05: the frame alone does not decide them.
+        A coefficient of the distortion is among them only if the prior decides a displacement that
+        it takes part in: the sensitivity of the displacement along the coefficient's pattern over
+        the frame is at least 0.05 too.
     """
 
-    converged: bool
+    sampled_well: bool
+    fits_data: bool
     message: str
     rhat: dict[str, float]
     ess_bulk: dict[str, float]
@@ -104,12 +115,30 @@ class Diagnostics:
     likelihood_sensitivity: dict[str, float]
     prior_dominated: tuple[str, ...]
 
+    @property
+    def trustworthy(self) -> bool:
+        """Whether the run is sampled well and its model fits the counts."""
+        return self.sampled_well and self.fits_data
+
+    @property
+    def columns(self) -> dict[str, dict[str, float]]:
+        """What there is to say of every parameter, for `bayesfred.sampling.summary.summary`."""
+        return {
+            "rhat": self.rhat,
+            "ess_bulk": self.ess_bulk,
+            "ess_tail": self.ess_tail,
+            "tau": self.tau,
+            "prior_sensitivity": self.prior_sensitivity,
+            "likelihood_sensitivity": self.likelihood_sensitivity,
+        }
+
 
 def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
-    """Judge whether a chain has converged, whether its model fits the counts, and what its prior does.
+    """Judge how a chain is sampled, whether its model fits the counts, and what its prior does.
 
-    Converged means: largest R-hat at most 1.01, every bulk and tail effective sample size at least
-    `target_ess`, at least one move in ten accepted, and a MAP at which the gradient vanishes.
+    Sampled well means: largest R-hat at most 1.01, every bulk and tail effective sample size at
+    least `target_ess`, at least one move in ten accepted, and a MAP at which the gradient vanishes.
+    The model fits where the deviance at the MAP is within 5 standard deviations of its expectation.
 
     Parameters
     ----------
@@ -136,10 +165,21 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
     tau = np.array([autocorrelation_time(series) for series in walkers])
     total_steps = max(chain.chain.shape[1], 1)
     acceptance = float(np.mean(chain.accepted)) / total_steps
-    converged, message = _verdict(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
+    failures = _failures(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
+    fit = fit_statistics(posterior, chain.estimate.params)
+    fits_data = abs(misfit(fit)) <= CONSISTENT
+    message = f"{'not ' if failures or not fits_data else ''}trustworthy: {_fit_sentence(fit)} " + (
+        f"Not sampled well: {'; '.join(failures)}."
+        if failures
+        else f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
+        f"{min(bulk.min(), tail.min()):.0f}, acceptance {acceptance:.1%}."
+    )
     prior, likelihood = _sensitivities(chain, posterior)
+    dominated = prior >= INFORMATIVE
+    dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
     return Diagnostics(
-        converged=converged,
+        sampled_well=not failures,
+        fits_data=fits_data,
         message=message,
         rhat=_by_name(names, rhat),
         ess_bulk=_by_name(names, bulk),
@@ -149,10 +189,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         n_draws=n_ensembles * n_steps * n_walkers,
         prior_sensitivity=_by_name(names, prior),
         likelihood_sensitivity=_by_name(names, likelihood),
-        prior_dominated=tuple(
-            name for name, value in zip(names, prior, strict=True) if value >= INFORMATIVE
-        ),
-        **fit_statistics(posterior, chain.estimate.params),
+        prior_dominated=tuple(np.array(names)[dominated].tolist()),
+        **fit,
     )
 
 
@@ -182,22 +220,54 @@ def autocorrelation_time(series: Floats, window: float = 5.0) -> float:
     return float(tau[closed[0] if closed.size else -1])
 
 
+def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
+    """Which of these parameters matter to what is measured, shape (number of parameters,).
+
+    A frame hardly tells u x from x^2, as u is nearly x: it knows the sum of two such coefficients,
+    the prior their difference, and the difference moves nothing. So a coefficient of the distortion
+    is judged by displacements. With W the design matrix of f and g at points all over the frame,
+    W theta is the displacement, and (W^T W theta)_k its component along the pattern that a unit of
+    coefficient k makes. It is this component whose sensitivity to the prior counts.
+    """
+    d = posterior.model.polynomial
+    visible = np.ones(parameters.size, dtype=bool)
+    terms = parameters[parameters < d.n_terms]
+    if not terms.size:
+        return visible
+    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
+    x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, FIELD_POINTS).T))
+    u, v = d.image_position(chain.estimate.params[: d.n_terms], x, y)
+    imaged = np.isfinite(u + v)
+    design = d.design_matrix(u[imaged], v[imaged], x[imaged], y[imaged]).reshape(-1, d.n_terms)
+    draws, names = _draws(chain), tuple(chain.parameter_names[k] for k in terms)
+    components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
+    sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
+    visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
+    return visible
+
+
+def _draws(chain: Chain) -> Floats:
+    """All draws after burn-in, walker by walker, shape (n, d)."""
+    kept = chain.chain[:, chain.burn_in :]
+    return kept.swapaxes(1, 2).reshape(-1, len(chain.parameter_names))
+
+
 def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats]:
     """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
     names = chain.parameter_names
-    draws = (
-        chain.chain[:, chain.burn_in :].swapaxes(1, 2).reshape(-1, len(names))
-    )  # walker by walker
+    draws = _draws(chain)
     log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
     log_prior = posterior.log_prior(draws)
     return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
 
 
 def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Floats:
-    """Sensitivity of every parameter to that factor of the posterior whose logarithm at the draws is given, shape (d,)."""
-    from arviz_stats import (
-        psense,
-    )  # takes long to load, and most of what imports this module judges no chain
+    """Sensitivity of every parameter to one factor of the posterior, shape (d,).
+
+    `log_part` is the factor's logarithm at the draws, shape (n,).
+    """
+    # takes long to load, and most of what imports this module judges no chain
+    from arviz_stats import psense
 
     if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
         return np.full(len(names), np.nan)
@@ -222,14 +292,20 @@ def _by_name(names: tuple[str, ...], values: Floats) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
-def _verdict(
-    rhat: Floats,
-    ess: Floats,
-    acceptance: float,
-    chain: Chain,
-    target_ess: float,
-) -> tuple[bool, str]:
-    """Whether all criteria are met, and the line that says which are not."""
+def _fit_sentence(fit: Mapping[str, float]) -> str:
+    """Say whether the model fits the counts."""
+    excess = misfit(fit)
+    side = "below" if excess < 0 else "above"
+    deviance = f"deviance {abs(excess):.1f} standard deviations {side} its expectation"
+    if abs(excess) <= CONSISTENT:
+        return f"The model fits the counts: {deviance}."
+    return f"The model does not fit the counts: {deviance}, expected at most {CONSISTENT:.0f}."
+
+
+def _failures(
+    rhat: Floats, ess: Floats, acceptance: float, chain: Chain, target_ess: float
+) -> list[str]:
+    """What is wrong with the sampling, criterion by criterion."""
     names = chain.parameter_names
     worst, least = int(np.argmax(rhat)), int(np.argmin(ess))
     failures = []
@@ -242,10 +318,5 @@ def _verdict(
     if not acceptance >= MIN_ACCEPTANCE:
         failures.append(f"acceptance {acceptance:.1%} is below {MIN_ACCEPTANCE:.0%}")
     if not chain.estimate.at_maximum:
-        failures.append(f"the MAP did not converge ({chain.estimate.message})")
-    if failures:
-        return False, "not converged: " + "; ".join(failures)
-    return True, (
-        f"converged: R-hat at most {rhat[worst]:.4f}, effective sample size at least "
-        f"{ess[least]:.0f}, acceptance {acceptance:.1%}"
-    )
+        failures.append(f"the MAP is not at the maximum ({chain.estimate.message})")
+    return failures

@@ -39,7 +39,7 @@ from bayesfred.errors import InputError, printable
 from bayesfred.io import tables
 from bayesfred.io.lock import only_writer
 from bayesfred.io.paths import may_write
-from bayesfred.model.posterior import one_thread
+from bayesfred.model.threads import one_thread
 from bayesfred.sampling.sampler import versions
 
 WAITING = 4  # tasks sent ahead for each worker that is known

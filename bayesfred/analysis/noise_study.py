@@ -29,7 +29,8 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise
-from bayesfred.model.posterior import Nuisances, Posterior
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chainfile import fingerprint

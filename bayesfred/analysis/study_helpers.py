@@ -1,4 +1,4 @@
-"""What studies do with one simulated frame: fit it as `find_map` and `sample` do, in memory, and count intervals that hold."""
+"""What studies do with one simulated frame: fit it as a user would, and count intervals that hold."""
 
 import math
 from typing import Literal, get_args
@@ -10,17 +10,15 @@ from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
-from bayesfred.sampling.convergence import convergence
-from bayesfred.sampling.ensembles import advance, begin, check_start
-from bayesfred.sampling.sampler import burn_in
+from bayesfred.sampling.convergence import effective_sizes
+from bayesfred.sampling.sampler import sample
 
 Method = Literal["laplace", "mcmc"]
 
 LEVELS = (0.68, 0.95)  # of the intervals whose coverage is counted
 
-WALKERS = 32
-FIRST_STEPS = 13
-MOST_STEPS = 20_000
+ENSEMBLES = 2
+WALKERS = 16  # of each, at least
 
 
 def check(what: str, replicates: int, method: str) -> None:
@@ -55,8 +53,9 @@ def draws(
 ) -> Floats:
     """Nearly independent draws, shape (n, d), n about `ess` or more.
 
-    Of a chain that is long enough for so many effective draws those are kept that lie an
-    autocorrelation time apart.
+    Of a chain with as many effective draws, those that lie an autocorrelation time apart are kept.
+    It is `sample` that makes the chain, with the stopping rule that every user gets, so that a
+    calibration judges that rule, too. Two ensembles are the fewest that R-hat can compare.
     """
     if method == "laplace":
         normal = np.random.default_rng(seed).multivariate_normal(
@@ -65,26 +64,25 @@ def draws(
         return np.asarray(
             normal[np.isfinite(posterior.log_prob(normal))]
         )  # those that the prior admits
-    walkers = max(WALKERS, 2 * (posterior.n_parameters + 1))
-    start = begin(posterior, estimate, int(seed.generate_state(1, np.uint64)[0]), 1, walkers)
-    check_start(posterior.parameter_names, start)
-    steps, due = advance(posterior, estimate, start), FIRST_STEPS
-    kept: list[Floats] = []
-    while due <= MOST_STEPS:
-        kept += [next(steps).coords[0] for _ in range(due - len(kept))]
-        chain = np.stack(kept)[None]
-        chain = chain[:, burn_in(chain) :]
-        _, bulk, tail = convergence(chain)
-        effective = float(min(bulk.min(), tail.min()))
-        if effective >= ess:
-            apart = round(
-                chain[..., 0].size / effective
-            )  # of 300 draws correlated by less, ranks spread 0.3 % more
-            return np.asarray(chain[0, ::apart].reshape(-1, posterior.n_parameters))
-        due = math.ceil(1.5 * due)
-    raise InputError(
-        f"sampling: got {effective:.0f} effective draws after {len(kept)} steps, expected {ess}"
+    chain = sample(
+        posterior,
+        estimate,
+        seed=int(seed.generate_state(1, np.uint64)[0]),
+        ensembles=ENSEMBLES,
+        walkers=max(WALKERS, 2 * (posterior.n_parameters // 2 + 1)),  # they span all directions
+        target_ess=ess,
+        progress=False,
     )
+    kept = chain.chain[:, chain.burn_in :]
+    effective = float(np.min(effective_sizes(kept)))
+    if effective < ess:
+        raise InputError(
+            f"sampling: got {effective:.0f} effective draws after {chain.chain.shape[1]} steps, "
+            f"expected {ess}"
+        )
+    # of 300 draws whose correlation is less, ranks spread 0.3 % more
+    apart = round(kept[..., 0].size / effective)
+    return np.asarray(kept[:, ::apart].reshape(-1, posterior.n_parameters))
 
 
 def coverage_error(level: float, n: int) -> float:

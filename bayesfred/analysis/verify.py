@@ -1,28 +1,32 @@
-"""Whether a chain file is what it says it is: what can be computed again is, and compared.
+"""Whether a chain file is what it says it is: its numbers are computed again and compared.
 
-On the machine and with the packages that made a run, everything comes out bit for bit. Others round
-differently in the last digits, so a check allows for that much, and says how far off it was.
+On the machine and with the packages that made a run, everything agrees bit for bit. Others round
+differently in the last digits, so a check allows for that much, and reports the difference.
 """
 
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from threadpoolctl import threadpool_limits
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.io.hdf5_checks import stated_digest
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
-from bayesfred.sampling.chainfile import Chain, changed_parts, fingerprint, open_chain
-from bayesfred.sampling.ensembles import advance, begin
+from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import (
+    changed_parts,
+    fingerprint,
+    open_chain,
+    stored_fingerprint,
+)
 from bayesfred.sampling.moves import LaplaceMove
+from bayesfred.sampling.sampler import sample
 
-DRAWS = 1000  # whose log-probability is computed again, unless all are
-STEPS = 10  # made again from the seed
+DRAWS = 1000  # whose log-probability is computed again, unless those of all draws are
+STEPS = 10  # replayed from the seed
 ROUNDING = 1e-6  # of a log-probability, and of a draw in standard deviations
 NEAR = 0.01  # standard deviations between the stored maximum and the one found from it
 
@@ -61,15 +65,16 @@ def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
         _posterior(path, posterior),
         _log_prob(chain, near, every_draw),
         *_maximum(chain, posterior),
-        *_steps(chain, near),
+        *_steps(chain),
     ]
 
 
 def _posterior(path: Path, posterior: Posterior) -> Check:
-    changed = changed_parts(path, posterior)
+    rebuilt = fingerprint(posterior)
+    changed = changed_parts(stored_fingerprint(path), rebuilt)
     if changed:
         return Check("posterior", f"differs when rebuilt: {', '.join(changed)}", False)
-    parts = ", ".join(f"{name} {digest[:8]}" for name, digest in fingerprint(posterior).items())
+    parts = ", ".join(f"{name} {digest[:8]}" for name, digest in rebuilt.items())
     return Check("posterior", f"rebuilt with the same hashes: {parts}", True)
 
 
@@ -87,7 +92,7 @@ def _log_prob(chain: Chain, posterior: Posterior, every_draw: bool) -> Check:
 
 
 def _farthest(a: Floats, b: Floats) -> tuple[float, float]:
-    """The largest difference of two sets of log-probabilities, and how much of what rounding may do it is."""
+    """The largest difference of two sets of log-probabilities, and in units of what is allowed."""
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return np.inf, np.inf
     off = np.abs(a - b)
@@ -119,26 +124,36 @@ def _maximum(chain: Chain, posterior: Posterior) -> list[Check]:
     ]
 
 
-def _steps(chain: Chain, posterior: Posterior) -> list[Check]:
-    """The first steps made again, and the numbers of accepted moves, for which the first step is needed."""
+def _steps(chain: Chain) -> list[Check]:
+    """The first steps replayed, and the numbers of accepted moves.
+
+    A chain does not show which moves of the first step were accepted; the replay does.
+    """
     ensembles, n_steps, walkers = chain.log_prob.shape
     try:
-        start = begin(posterior, chain.estimate, chain.seed, ensembles, walkers)
-        with threadpool_limits(1, user_api="blas"):
-            steps = list(islice(advance(posterior, chain.estimate, start), min(STEPS, n_steps)))
+        replay = sample(
+            chain.posterior(),
+            chain.estimate,
+            seed=chain.seed,
+            ensembles=ensembles,
+            walkers=walkers,
+            steps=min(STEPS, n_steps),
+            progress=False,
+        )
     except InputError as error:
         return [Check("first steps", str(error), False)]
-    again, stored = np.stack([s.coords for s in steps], axis=1), chain.chain[:, : len(steps)]
+    steps = replay.chain.shape[1]
+    again, stored = replay.chain, chain.chain[:, :steps]
     off = np.abs(again - stored) / np.sqrt(np.diag(chain.estimate.covariance))
     wrong = np.flatnonzero(~(off.max(axis=(0, 2, 3)) <= ROUNDING))
-    finding = f"{len(steps)} made again from seed {chain.seed}: "
+    finding = f"{steps} replayed from seed {chain.seed}: "
     if wrong.size:
         finding += f"differ from step {wrong[0] + 1} on"
     elif np.array_equal(again, stored):
         finding += "equal bit for bit"
     else:
         finding += f"differ by at most {off.max():.1g} standard deviations"
-    moved = steps[0].accepted + np.any(np.diff(chain.chain, axis=1) != 0.0, axis=3).sum(axis=1)
+    moved = replay.accepted - _moved(again) + _moved(chain.chain)
     counted = (
         f"{n_steps} steps of {ensembles} x {walkers} walkers, {chain.accepted.sum()} moves accepted"
     )
@@ -150,3 +165,8 @@ def _steps(chain: Chain, posterior: Posterior) -> list[Check]:
             np.array_equal(moved, chain.accepted),
         ),
     ]
+
+
+def _moved(chain: Floats) -> Ints:
+    """How often each walker moved after the first step, shape (ensembles, walkers)."""
+    return np.asarray(np.any(np.diff(chain, axis=1) != 0.0, axis=3).sum(axis=1))

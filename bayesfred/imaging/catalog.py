@@ -58,12 +58,14 @@ class SourceCatalog:
             first = int(np.argmin(good))
             raise InputError(
                 f"flux: got {self.flux[first]:g} for source {first}, expected > 0 and at most "
-                "9e15: remove it or mend it"
+                "9e15: remove it or correct it"
             )
 
     @classmethod
     def grid(cls, side: int, spacing: float, flux: float) -> Self:
-        """Lay out a square array of equal sources centred on the axis, row by row (the paper's object: 9, 50, 1e5).
+        """Lay out a square array of equal sources centred on the axis, row by row.
+
+        The paper's object is `grid(9, 50.0, 1e5)`.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The image sensor: which points of the image plane make up a recorded pixel, and the sampling correction.
+"""The image sensor: which points of the image plane a recorded pixel consists of.
 
 Two pixel responses. `impulse` samples the image at the centre of every fine pixel, which is what
 the paper assumes of a frame that it has corrected; `box` integrates over the pixel, which is what a
@@ -26,10 +26,10 @@ from bayesfred.io.serialize import serializable
 PIXELS = ("impulse", "box")
 
 # Bound on the box rule's error along one axis. Up to pixels of 12 sigma the two axes together stay
-# below 6e-7 of the peak, even where the distortion narrows a spot 1.3 times: see `_box_order`.
+# below 6e-7 of the peak, even where the distortion narrows an image 1.3 times: see `_box_order`.
 BOX_TOLERANCE = 2e-8
 
-# Points along a pixel's side beyond which nobody waits for the sum over their square.
+# Most points along a pixel's side: the sum over their square would take too long.
 MOST_POINTS = 1000
 
 
@@ -109,7 +109,9 @@ class Detector:
         return _centred(nx) * self.binning, _centred(ny) * self.binning
 
     def quadrature(self, sigma: float, beta: float = math.inf) -> tuple[Floats, Floats]:
-        """Points and weights along one axis whose sum gives a recorded pixel; the same rule serves both axes.
+        """Points and weights along one axis whose sum gives a recorded pixel.
+
+        The same rule serves both axes.
 
         Parameters
         ----------
@@ -155,9 +157,9 @@ def _centred(n: int) -> Floats:
 
 
 def _box_order(width: float, beta: float) -> int:
-    """Smallest Gauss-Legendre order q that integrates a Gaussian, or a Moffat, over `width` sigma to BOX_TOLERANCE.
+    """Smallest Gauss-Legendre order q that integrates the PSF over a pixel to BOX_TOLERANCE.
 
-    Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some
+    The PSF is a Gaussian or a Moffat function, the pixel `width` sigma wide. Over an interval h the rule's error is h^(2q+1) (q!)^4 / ((2q+1) ((2q)!)^3) |F^(2q)| at some
     point of it. The even derivatives of F = exp(-x^2 / 2 s^2) are largest at x = 0 (its Fourier
     transform is positive), where they are (2q-1)!! / s^(2q) with (2q-1)!! = (2q)! / (2^q q!). So,
     per unit of h, it is at most
@@ -169,7 +171,7 @@ def _box_order(width: float, beta: float) -> int:
     (2q)! / q! times beta (beta + 1) ... (beta + q - 1) / (2 beta s^2)^q. So every step of e_q has a
     factor 1 + (q - 1) / beta.
 
-    Distortion that narrows a spot by a factor c multiplies e_q by c^(2q).
+    Distortion that narrows an image by a factor c multiplies e_q by c^(2q).
     """
     order, bound = 0, 1.0
     while order == 0 or bound > BOX_TOLERANCE:
@@ -185,7 +187,7 @@ def _box_order(width: float, beta: float) -> int:
 
 
 def sampling_matrix(n: int) -> Floats:
-    """Build the paper's matrix R: what integration over pixels makes of impulse samples along one axis.
+    """Build the paper's matrix R, which turns impulse samples along one axis into pixel integrals.
 
     A band-limited image is the sum over m of I_m sinc(u - m) (Whittaker-Shannon; sinc t is sin(pi
     t) / pi t). Its integral over pixel i is the sum of R_im I_m with

@@ -177,9 +177,9 @@ class Polynomial:
     def largest_displacement(self, half_width: float, half_height: float) -> Floats:
         """The largest |f| and |g| over a frame that a unit of every coefficient makes.
 
-        They are those of sources at a grid of object points whose images stand where the sources
-        do, or up to a tenth nearer to the axes: so a coefficient that only exchanges u for x has
-        a displacement too.
+        They are those at a grid of object points whose images stand where the sources do, or up
+        to a tenth nearer to the axes: so a coefficient that only exchanges u for x has a
+        displacement too. Between the grid's points displacements may exceed them by a few per cent.
 
         Parameters
         ----------

@@ -1,1 +1,1 @@
-"""What the counts say: a frame to draws from its posterior."""
+"""What the counts say: parameters, priors and likelihood of a frame, and its posterior."""

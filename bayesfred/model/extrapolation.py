@@ -12,6 +12,7 @@ import numpy as np
 from scipy import linalg
 
 from bayesfred._typing import Floats, Ints
+from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.kernels.clusters import Clusters
 from bayesfred.model.kernels.extrapolate import Extrapolated, describe
 from bayesfred.model.kernels.fluxes import Fitted
@@ -20,6 +21,7 @@ from bayesfred.model.kernels.fluxes import Fitted
 class FluxExtrapolation(NamedTuple):
     """Most likely fluxes as a linear function of the parameters, and what is known of their Hessian H."""
 
+    model: ForwardModel  # whose sources these are
     params: Floats  # (d,)
     fluxes: Floats  # (s,) there
     slope: Floats  # (s, d)
@@ -34,6 +36,7 @@ class FluxExtrapolation(NamedTuple):
 
 
 def flux_extrapolation(
+    model: ForwardModel,
     fluxes_at: Callable[[Floats], Floats],
     fitted: Fitted,
     z: Floats,
@@ -53,4 +56,6 @@ def flux_extrapolation(
         [0.5 * (fluxes_at(params + axis) - fluxes_at(params - axis)) for axis in axes.T], axis=1
     )
     slope = linalg.solve_triangular(axes, np.nan_to_num(change).T, trans="T", lower=True).T
-    return FluxExtrapolation(params, fitted.fluxes, slope, fitted.clusters, describe(fitted, z))
+    return FluxExtrapolation(
+        model, params, fitted.fluxes, slope, fitted.clusters, describe(fitted, z)
+    )

@@ -1,247 +1,33 @@
-"""The posterior of a field distortion: prior times likelihood of a frame, as functions of a parameter vector.
+"""The posterior of a field distortion: prior times likelihood of a frame, of a parameter vector.
 
-Parameters are the distortion coefficients, the background and whatever `Nuisances` leaves free. The
-likelihood and its derivatives are in `kernels`; `estimate.py` finds the maximum, `sampling.py`
-draws.
+`parameters` says what the parameters are, `priors` and `likelihood` hold the two factors.
+`optimize.find_map` finds the maximum, `sampling.sampler` draws.
 """
 
-import copy
-import os
-import queue
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaln
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
-from bayesfred.imaging.kernels.jacobian import Basis
-from bayesfred.imaging.kernels.render import image
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
-from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
-from bayesfred.model.kernels.fisher import fisher
-from bayesfred.model.kernels.fluxes import Drawn, draw, log_likelihoods
-from bayesfred.model.kernels.gradient import gradient
-from bayesfred.model.kernels.likelihood import (
-    LIMIT,
-    MASKED,
-    Counts,
-    Workspace,
-    clear,
-    new_workspace,
-)
+from bayesfred.model.extrapolation import FluxExtrapolation
+from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise
-
-FluxMode = Literal["fixed", "scale", "free"]
-
-BACKGROUND_TERMS = (
-    "background",
-    "background_u",
-    "background_v",
-    "background_u2",
-    "background_uv",
-    "background_v2",
-)
-SOURCE_NUISANCES = ("flux_scale", "offset_x", "offset_y", "psf_sigma", "position_scatter")
-
-_pool: ThreadPoolExecutor | None = None
-
-
-def _threads() -> ThreadPoolExecutor:
-    """The threads that share an ensemble's walkers with the calling one; their number follows numba's setting."""
-    global _pool
-    if _pool is None:
-        _pool = ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, "bayesfred")
-    return _pool
-
-
-def _forget_threads() -> None:
-    global _pool
-    _pool = None
-
-
-os.register_at_fork(after_in_child=_forget_threads)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Evaluate ensembles in the calling thread alone: for work of which every core does its own."""
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(threads)
-
-
-@serializable("nuisances")
-@dataclass(frozen=True)
-class Nuisances:
-    """What else is unknown beside the distortion and a constant background.
-
-    Parameters
-    ----------
-    flux : {"fixed", "scale", "free"}
-        Catalogue fluxes are exact; or right but for a common factor, the parameter `flux_scale`; or
-        each is free. Free fluxes are not sampled: the likelihood takes its maximum over them, with
-        the Laplace term, under a prior Gamma(2) whose mean is the catalogue's flux.
-    offset : bool
-        Whether the pointing is unknown: parameters `offset_x`, `offset_y`, pixel, added to every
-        source's position.
-    psf_sigma : bool
-        Whether the PSF's width is unknown: parameter `psf_sigma`, pixel, the `sigma` that a PSF of
-        any kind has.
-    background_order : {0, 1, 2}
-        Degree of the background polynomial in u and v, which run from -1 to 1 over the frame:
-        parameters `background`, then `background_u`, `background_v`, then `background_u2`,
-        `background_uv`, `background_v2`, counts per pixel.
-    footprint : float or None, pixel
-        Only pixels within this distance of a catalogue position enter the likelihood; for frames
-        with sources that the catalogue lacks.
-    position_scatter : bool
-        Whether the sources lie off their catalogue positions, by normal errors of unknown standard
-        deviation along each axis: parameter `position_scatter`, pixel, as imaged. Needs free
-        fluxes. Like these, the shifts are not sampled.
-
-    Raises
-    ------
-    InputError
-        If a value is not one of those listed, or positions scatter with fluxes that are not free.
-
-    Examples
-    --------
-    >>> Nuisances(flux="scale", offset=True).names
-    ('flux_scale', 'offset_x', 'offset_y')
-    """
-
-    flux: FluxMode = "fixed"
-    offset: bool = False
-    psf_sigma: bool = False
-    background_order: int = 0
-    footprint: float | None = None
-    position_scatter: bool = False
-
-    def __post_init__(self) -> None:
-        if self.flux not in get_args(FluxMode):
-            raise InputError(
-                f"nuisances: flux: got {self.flux!r}, expected one of "
-                f"{', '.join(get_args(FluxMode))}"
-            )
-        if self.background_order not in (0, 1, 2):
-            raise InputError(
-                f"nuisances: background_order: got {self.background_order!r}, expected 0, 1 or 2"
-            )
-        if self.footprint is not None and not (np.isfinite(self.footprint) and self.footprint > 0):
-            raise InputError(
-                f"nuisances: footprint: got {self.footprint}, expected a radius in pixels > 0"
-            )
-        if self.position_scatter and self.flux != "free":
-            raise InputError(
-                f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free "
-                "ones: set flux to free"
-            )
-
-    @property
-    def source_names(self) -> tuple[str, ...]:
-        """The nuisance parameters that act on the sources."""
-        free = (
-            self.flux == "scale",
-            self.offset,
-            self.offset,
-            self.psf_sigma,
-            self.position_scatter,
-        )
-        return tuple(name for name, is_free in zip(SOURCE_NUISANCES, free, strict=True) if is_free)
-
-    @property
-    def background_names(self) -> tuple[str, ...]:
-        """The coefficients of the background polynomial."""
-        return BACKGROUND_TERMS[: (1, 3, 6)[self.background_order]]
-
-    @property
-    def profiled(self) -> int:
-        """Numbers of every source that are not sampled: flux, and shift along u and v."""
-        return 3 if self.position_scatter else int(self.flux == "free")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All nuisance parameters but the constant background."""
-        return (*self.source_names, *self.background_names[1:])
-
-
-def _usable(
-    model: ForwardModel,
-    counts: Floats,
-    mask: npt.ArrayLike | None,
-    noise: PoissonNoise | BackgroundNoise,
-    nuisances: Nuisances,
-) -> Flags:
-    """The pixels for the likelihood, after checking that the frame can be explained at all."""
-    shape = model.detector.shape
-    used = np.ones(shape, bool) if mask is None else np.array(mask, dtype=bool)
-    for name, array in (("counts", counts), ("mask", used)):
-        if array.shape != shape:
-            raise InputError(f"{name}: got shape {array.shape}, expected the detector's {shape}")
-    ny, nx = model.detector.fine_shape
-    sources = model.sources
-    if not np.any((np.abs(sources.x) <= 0.5 * nx) & (np.abs(sources.y) <= 0.5 * ny)):
-        raise InputError(
-            f"catalogue: got {len(sources)} sources, all outside the frame of {nx} x {ny} pixels, "
-            "expected positions in pixels "
-            "from the frame's middle: check the columns, their unit and their origin"
-        )
-    if nuisances.footprint is not None:
-        used &= _footprint(model, nuisances.footprint)
-    if not used.any():
-        raise InputError(
-            "counts: every pixel is masked, expected pixels to fit: check the mask and the "
-            "footprint"
-        )
-    n_bad = int(np.sum(used & ~np.isfinite(counts)))
-    if n_bad:
-        raise InputError(
-            f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them"
-        )
-    if isinstance(noise, PoissonNoise) and noise.read_noise == 0 and counts[used].min() < 0:
-        raise InputError(
-            f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: check "
-            "gain and pedestal, give "
-            "read_noise, or mask these pixels"
-        )
-    return used
-
-
-def _footprint(model: ForwardModel, radius: float) -> Flags:
-    """Pixels within `radius` of a source's catalogue position."""
-    u, v = model.detector.pixel_centres()
-    inside = np.zeros((v.size, u.size), bool)
-    for x, y in zip(model.sources.x, model.sources.y, strict=True):
-        across, along = np.abs(u - x) <= radius, np.abs(v - y) <= radius
-        inside[np.ix_(along, across)] |= (u[across] - x) ** 2 + (
-            v[along, None] - y
-        ) ** 2 <= radius**2
-    return inside
-
-
-def _square(background: Floats) -> Floats:
-    """The background's coefficients of 1, u, v, u^2, uv, v^2 as a matrix [power of u, power of v]."""
-    b = background
-    return np.array([[b[0], b[2], b[5]], [b[1], b[4], 0.0], [b[3], 0.0, 0.0]])
+from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
+from bayesfred.model.pixels import usable_pixels
+from bayesfred.model.protocol import TargetDensity
 
 
 @serializable("posterior")
 @dataclass(frozen=True, eq=False, init=False)
-class Posterior:
+class Posterior(TargetDensity):
     """Posterior of distortion, background and nuisances given a frame.
 
     Parameters
@@ -249,13 +35,15 @@ class Posterior:
     model : ForwardModel
     counts : array_like, shape (ny, nx), counts
     prior : mapping of str to frozen scipy.stats distribution, optional
-        By parameter name; the others get `priors.default_prior`. Parameters are independent a
-        priori. A distortion that leaves a source without an image, or folds the frame (D <= 0)
-        within two of the PSF's widths of one, has probability zero.
+        By parameter name; the others get the default of the table of parameters. Parameters are
+        independent a priori. A distortion that leaves a source without an image, or folds the frame
+        (D <= 0) within two of the PSF's widths of one, has probability zero.
     noise : PoissonNoise or BackgroundNoise
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is to be used.
     nuisances : Nuisances
+    extrapolation : FluxExtrapolation, optional
+        Where free fluxes have their maximum near some parameters: `near` makes it.
 
     Attributes
     ----------
@@ -267,7 +55,8 @@ class Posterior:
     ------
     InputError
         If the frame does not fit the detector, holds values that no noise model explains, every
-        pixel is masked, no source lies in the frame, or a prior is unusable.
+        pixel is masked, no source lies in the frame, or a prior is unusable; if the extrapolation
+        is of another model.
 
     Examples
     --------
@@ -286,8 +75,7 @@ class Posterior:
     noise: PoissonNoise | BackgroundNoise
     mask: Flags
     nuisances: Nuisances
-
-    _extrapolation: ClassVar[FluxExtrapolation | None] = None
+    extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
 
     def __init__(
         self,
@@ -298,58 +86,71 @@ class Posterior:
         noise: PoissonNoise | BackgroundNoise = PoissonNoise(),
         mask: npt.ArrayLike | None = None,
         nuisances: Nuisances = Nuisances(),
+        extrapolation: FluxExtrapolation | None = None,
     ) -> None:
-        if isinstance(noise, BackgroundNoise) and (
-            nuisances.flux == "free" or nuisances.background_order
-        ):
-            raise InputError(
-                "noise: got BackgroundNoise with free fluxes or a varying background, expected "
-                "fixed or scaled fluxes and "
-                "background_order 0: use PoissonNoise"
-            )
         frame = np.array(counts, dtype=np.float64)
-        used = _usable(model, frame, mask, noise, nuisances)
-        for name, value in (
-            ("model", model),
-            ("counts", np.where(np.isfinite(frame), frame, 0.0)),
-            ("noise", noise),
-            ("mask", used),
-            ("nuisances", nuisances),
-        ):
+        used = usable_pixels(model, frame, mask, noise, nuisances)
+        if extrapolation is not None and extrapolation.model is not model:
+            raise InputError(
+                "extrapolation: got that of another model, expected this one's: leave it out"
+            )
+        values: tuple[Any, ...] = (
+            model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
+            extrapolation,
+        )  # fmt: skip
+        for name, value in zip((f.name for f in fields(self)), values, strict=True):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "prior", self._complete(dict(prior or {})))
+        object.__setattr__(self, "prior", self._with_defaults(dict(prior or {})))
 
-    def _complete(self, given: dict[str, Any]) -> dict[str, Any]:
+    def _with_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
         """The given priors checked, the default ones added."""
         unknown = sorted(set(given) - set(self.parameter_names))
         if unknown:
-            raise InputError(
-                f"prior: got {', '.join(unknown)}, expected names among "
-                f"{', '.join(self.parameter_names)}"
-            )
+            names = ", ".join(self.parameter_names)
+            raise InputError(f"prior: got {', '.join(unknown)}, expected names among {names}")
         for name, distribution in given.items():
             priors.check(name, distribution)
-        return {name: given.get(name) or self.default_prior(name) for name in self.parameter_names}
-
-    def default_prior(self, name: str) -> Any:
-        """The prior that a parameter has unless another is given."""
-        m = self.model
-        return priors.default_prior(name, m.polynomial, m.detector, self._level, m.psf.sigma)
+        return {p.name: given.get(p.name, p.prior) for p in self.parameters}
 
     @cached_property
-    def _level(self) -> float:
-        """Mean counts per pixel, at least one in the frame."""
-        return max(float(np.mean(self.counts[self.mask])), 1.0 / float(self.mask.sum()))
+    def likelihood(self) -> FrameLikelihood:
+        """The likelihood of the frame."""
+        width = self.prior.get("psf_sigma")
+        narrowest = None if width is None else float(width.ppf(1e-6))
+        return FrameLikelihood(
+            self.model, self.counts, self.noise, self.mask, self.nuisances, self.parameters,
+            narrowest, self.extrapolation,
+        )  # fmt: skip
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The table of parameters, in the order of every parameter vector."""
+        return parameter_table(self.model, self.nuisances, self.counts[self.mask])
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of every parameter vector."""
-        return (*self.model.distortion.names, "background", *self.nuisances.names)
+        return tuple(parameter.name for parameter in self.parameters)
 
     @property
     def n_parameters(self) -> int:
         """Length of a parameter vector."""
-        return len(self.parameter_names)
+        return len(self.parameters)
+
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """Scale parameters, on which proposals nest the Laplace approximation."""
+        return ("position_scatter",) if self.nuisances.position_scatter else ()
+
+    @cached_property
+    def support(self) -> tuple[Floats, Floats]:
+        """The least and the largest value that the prior admits of every parameter, shape (d,)."""
+        low, high = np.array([distribution.support() for distribution in self.prior.values()]).T
+        return low, high
+
+    def start(self) -> Floats:
+        """Parameters to begin a search from: no distortion, the frame's median as background."""
+        return np.array([parameter.start for parameter in self.parameters])
 
     def log_prob(self, params: npt.ArrayLike) -> Any:
         """Log-posterior density up to the evidence; the likelihood is normalised.
@@ -369,42 +170,57 @@ class Posterior:
         InputError
             If a parameter vector has another length.
         """
-        vectors = self._vectors(params)
-        prior = self.log_prior(vectors)
-        out = np.where(np.isnan(prior), -np.inf, prior)
-        arguments = self._arguments(vectors)
-        extrapolated = self._extrapolation and self._extrapolation.at(vectors)
-        turn = np.zeros(1, np.int64)
-
-        def evaluate() -> None:
-            with self._workspace() as w:
-                log_likelihoods(
-                    self._optics,
-                    self._frame,
-                    w,
-                    *arguments,
-                    self._flux,
-                    self._free,
-                    extrapolated,
-                    turn,
-                    out,
-                )
-
-        helpers = [
-            _threads().submit(evaluate)
-            for _ in range(min(numba.get_num_threads(), len(vectors)) - 1)
-        ]
-        evaluate()
-        for helper in helpers:
-            helper.result()
-        out += np.where(np.isfinite(out), prior + self._constant, 0.0)
+        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
+        if vectors.ndim != 2 or vectors.shape[1] != self.n_parameters:
+            raise self._wrong_shape(params, f"({self.n_parameters},) or (n, {self.n_parameters})")
+        prior = self._log_prior(vectors)
+        out = self.likelihood.log_likelihood(vectors, prior > -np.inf)
+        out = np.where(out > -np.inf, out + prior, out)
         out[np.isnan(prior)] = np.nan
         return float(out[0]) if np.ndim(params) == 1 else out
 
-    def near(self, params: Floats, covariance: Floats) -> "Posterior":
-        """The same posterior, with a `log_prob` that is several times faster around `params` where fluxes are free.
+    def log_prior(self, params: npt.ArrayLike) -> Floats:
+        """Log-density of the prior for parameter vectors of shape (n, d)."""
+        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
+        return np.asarray(self._log_prior(vectors))
 
-        It foretells the most likely fluxes from those at `params`. Where that fails it looks for
+    def gradient(self, params: npt.ArrayLike) -> Floats:
+        """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
+        vector = self._vector(params)
+        if not np.isfinite(self.log_prob(vector)):
+            return np.full(vector.size, np.nan)
+        slopes = [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
+        return self.likelihood.gradient(vector) + slopes
+
+    def fisher(self, params: npt.ArrayLike) -> Floats:
+        """Fisher information of the frame about the parameters, free fluxes profiled out.
+
+        Returns
+        -------
+        ndarray, shape (d, d); NaN outside the prior's support
+            Without the prior.
+        """
+        vector = self._vector(params)
+        if not np.isfinite(self.log_prob(vector)):
+            return np.full((vector.size, vector.size), np.nan)
+        return self.likelihood.fisher(vector)
+
+    def information(self, params: npt.ArrayLike) -> Floats:
+        """Fisher information plus prior curvature, shape (d, d).
+
+        The inverse is the covariance of the Laplace approximation.
+        """
+        return self.fisher(params) + self.prior_information(params)
+
+    def prior_information(self, params: npt.ArrayLike) -> Floats:
+        """Curvature of the prior where it is positive, shape (d, d)."""
+        pairs = zip(self.prior.values(), self._vector(params), strict=True)
+        return np.diag([max(priors.slope(p, x)[1], 0.0) for p, x in pairs])
+
+    def near(self, params: Floats, covariance: Floats) -> "Posterior":
+        """The same posterior, with a faster `log_prob` around `params` where fluxes are free.
+
+        It extrapolates the most likely fluxes from those at `params`. Where that fails it looks for
         them as usual; values differ by rounding and at most 5e-5, by some 1e-6 within a few
         standard deviations.
 
@@ -429,332 +245,55 @@ class Posterior:
         >>> model = bf.ForwardModel(
         ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
         ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
-        >>> posterior = bf.Posterior(model, bf.simulate(model, [1e-4], 2.0, seed=1), nuisances=bf.Nuisances("free"))
+        >>> counts, free = bf.simulate(model, [1e-4], 2.0, seed=1), bf.Nuisances("free")
+        >>> posterior = bf.Posterior(model, counts, nuisances=free)
         >>> best = bf.find_map(posterior)
         >>> near = posterior.near(best.params, best.covariance)
         >>> bool(abs(near.log_prob(best.params) - posterior.log_prob(best.params)) < 1e-6)
         True
         """
-        if self.nuisances.profiled != 1:
+        close = self.likelihood.near(self._vector(params), covariance)
+        if close is self.likelihood:
             return self
-        arguments = [a[0] for a in self._arguments(self._vectors(params))]
-        unused = np.zeros(self._basis.row.size), np.zeros(6)
-        with self._drawn(arguments) as (w, drawn):
-            slope, z = gradient(
-                self._optics,
-                self._frame,
-                w,
-                drawn,
-                *arguments[1:],
-                self._free,
-                self._basis,
-                *unused,
-            )
-        close = copy.copy(self)
-        if np.isfinite(slope):
-            object.__setattr__(
-                close,
-                "_extrapolation",
-                flux_extrapolation(self.fluxes, drawn.fitted, z[:, 0], params, covariance),
-            )
-        return close
-
-    def log_prior(self, params: npt.ArrayLike) -> Floats:
-        """Log-density of the prior for parameter vectors of shape (n, d)."""
-        return self._log_prior(self._vectors(params))
-
-    @property
-    def hyperparameters(self) -> tuple[str, ...]:
-        """Scale parameters, on which proposals nest the Laplace approximation."""
-        return ("position_scatter",) if self.nuisances.position_scatter else ()
-
-    @cached_property
-    def support(self) -> tuple[Floats, Floats]:
-        """The least and the largest value that the prior admits of every parameter, shape (d,) each."""
-        low, high = np.array([distribution.support() for distribution in self.prior.values()]).T
-        return low, high
-
-    def gradient(self, params: npt.ArrayLike) -> Floats:
-        """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
-        vector = self._vectors(params)[0]
-        if not np.isfinite(self.log_prior(vector)[0]):
-            return np.full(vector.size, np.nan)
-        arguments = [a[0] for a in self._arguments(vector[None])]
-        sources, background = np.zeros(self._basis.row.size), np.zeros(6)
-        with self._drawn(arguments) as (w, drawn):
-            slope, _ = gradient(
-                self._optics,
-                self._frame,
-                w,
-                drawn,
-                *arguments[1:],
-                self._free,
-                self._basis,
-                sources,
-                background,
-            )
-        if np.isnan(slope):
-            return np.full(vector.size, np.nan)
-        if isinstance(self.noise, BackgroundNoise):
-            level = arguments[2][0]
-            residual = self.counts - self.expected_counts(vector)
-            squares = float(np.sum(residual[self.mask] ** 2))
-            background[0] += 0.5 * (squares / level - self._frame.pixels) / level
-        terms = len(self.nuisances.background_names)
-        scatter = [slope] if self.nuisances.position_scatter else []
-        kernel = np.concatenate([sources, scatter, background[:terms]])
-        out = self.model.polynomial.pull_back(kernel)[self._order]
-        if self.nuisances.flux == "scale":
-            out[self.parameter_names.index("flux_scale")] /= arguments[1][0]
-        out += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
-        return out
-
-    def fisher(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information of the frame about the parameters, free fluxes profiled out; without the prior.
-
-        Returns
-        -------
-        ndarray, shape (d, d); NaN outside the prior's support
-        """
-        vector = self._vectors(params)[0]
-        if not np.isfinite(self.log_prior(vector)[0]):
-            return np.full((vector.size, vector.size), np.nan)
-        arguments = [a[0] for a in self._arguments(vector[None])]
-        terms = len(self.nuisances.background_names)
-        size = self._basis.row.size + terms
-        out = np.zeros((size, size))
-        with self._drawn(arguments) as (w, drawn):
-            known = fisher(
-                self._optics,
-                self._frame,
-                w,
-                drawn,
-                *arguments[1:],
-                terms,
-                self._free,
-                self._basis,
-                out,
-            )
-        if np.isnan(known):
-            return np.full((vector.size, vector.size), np.nan)
-        if (
-            self.nuisances.position_scatter
-        ):  # independent of the others: it is known by the shifts' size alone
-            k = self._basis.row.size
-            out = np.insert(np.insert(out, k, 0.0, axis=0), k, 0.0, axis=1)
-            out[k, k] = known
-        if isinstance(self.noise, BackgroundNoise):
-            k = self._basis.row.size
-            out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
-        out = self.model.polynomial.pull_back(self.model.polynomial.pull_back(out).T)
-        if self.nuisances.flux == "scale":
-            k = self.model.distortion.n_terms
-            out[k] /= arguments[1][0]
-            out[:, k] /= arguments[1][0]
-        return out[np.ix_(self._order, self._order)]
-
-    def information(self, params: npt.ArrayLike, fisher: Floats | None = None) -> Floats:
-        """Fisher information, if not given, plus the prior's curvature: the inverse is the Laplace approximation's covariance."""
-        vector = self._vectors(params)[0]
-        curvature = [
-            max(priors.slope(p, x)[1], 0.0)
-            for p, x in zip(self.prior.values(), vector, strict=True)
-        ]
-        return (self.fisher(vector) if fisher is None else fisher) + np.diag(curvature)
+        return replace(self, extrapolation=close.extrapolation)
 
     def simulate(self, params: npt.ArrayLike, rng: np.random.Generator) -> Floats | None:
-        """Draw a frame given the parameters; what is not sampled, free fluxes and the sources' shifts, is drawn from its prior.
-
-        Returns
-        -------
-        ndarray, shape (ny, nx), counts
-            None where the posterior would have no density: a source is folded or has no image, or
-            expected counts are negative.
-        """
-        vector = self._vectors(params)[0]
-        theta, nuisances, background = (a[0] for a in self._arguments(vector[None]))
-        scale, *offset, sigma, scatter = (float(value) for value in nuisances)
-        flux = (
-            scale * self._flux
-            if not self._free
-            else self._flux * rng.gamma(2.0, 0.5, self._flux.size)
-        )
-        ny, nx = self.model.detector.shape
-        optics, out = self._optics, np.zeros(ny * stride(nx))
-        unfolded = image(optics, theta, *offset, sigma, flux, out)
-        # a shift is as imaged: it moves the image, and leaves the distortion that of the
-        # catalogue's position
-        if scatter:
-            by_x, by_y = scatter * rng.standard_normal((2, flux.size))
-            out[:] = 0.0
-            image(
-                optics._replace(x=optics.x + by_x, y=optics.y + by_y),
-                theta,
-                *offset,
-                sigma,
-                flux,
-                out,
-            )
-        sources, level = (
-            out.reshape(ny, -1)[:, :nx],
-            self._polynomial(background) - self.noise.shift,
-        )
-        if not (unfolded and np.all((sources + level)[self.mask] >= 0.0)):
-            return None
-        return self.noise.draw(sources, np.maximum(level, -sources), rng)
+        """Draw a frame given the parameters; see `FrameLikelihood.simulate`."""
+        return self.likelihood.simulate(self._vector(params), rng)
 
     def expected_counts(self, params: npt.ArrayLike) -> Floats:
-        """Expected counts of every pixel, free fluxes at their most likely values; NaN where a map folds.
+        """Expected counts of every pixel, free fluxes at their most likely values.
 
         Returns
         -------
         ndarray, shape (ny, nx), counts per pixel
+            NaN where a map folds.
         """
-        return self._expected(params)[0]
+        return self.likelihood.expected_counts(self._vector(params))
 
     def sigma(self, params: npt.ArrayLike) -> Floats:
         """Standard deviation of every pixel's counts under the noise model, shape (ny, nx)."""
-        level = self._vectors(params)[0][self.parameter_names.index("background")]
+        level = self._vector(params)[self.parameter_names.index("background")]
         return np.asarray(self.noise.fisher_weight(self.expected_counts(params), level) ** -0.5)
 
     def fluxes(self, params: npt.ArrayLike) -> Floats:
         """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
-        return self._expected(params)[1]
-
-    def _expected(self, params: npt.ArrayLike) -> tuple[Floats, Floats]:
-        vector = self._vectors(params)[0]
-        arguments = [a[0] for a in self._arguments(vector[None])]
-        ny, nx = self.model.detector.shape
-        with self._drawn(arguments) as (w, drawn):
-            sources = w.image.reshape(ny, -1)[:, :nx].copy()
-        bad = 0.0 if drawn.extra > -np.inf else np.nan
-        return sources + self._polynomial(
-            arguments[2]
-        ) - self.noise.shift + bad, drawn.fitted.fluxes + bad
-
-    def _polynomial(self, background: Floats) -> Floats:
-        """The background polynomial at every pixel."""
-        u, v = (np.arange(1 - n, n, 2) / n for n in self.model.detector.shape[::-1])
-        order = self.nuisances.background_order + 1
-        return np.asarray(
-            np.polynomial.polynomial.polygrid2d(u, v, _square(background)[:order, :order]).T
-        )
-
-    def start(self) -> Floats:
-        """Parameters to begin a search from: no distortion, the frame's median as background, nuisances as given."""
-        median = float(np.median(self.counts[self.mask]))
-        level = median if median > 0 else max(0.1 * float(np.mean(self.counts[self.mask])), 1e-6)
-        sigma = self.model.psf.sigma
-        known = {
-            "background": level,
-            "flux_scale": 1.0,
-            "psf_sigma": sigma,
-            "position_scatter": 0.1 * sigma,
-        }
-        return np.array([known.get(name, 0.0) for name in self.parameter_names])
-
-    def _vectors(self, params: npt.ArrayLike) -> Floats:
-        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        if vectors.ndim != 2 or vectors.shape[1] != self.n_parameters:
-            raise InputError(
-                f"params: got shape {np.shape(params)}, expected ({self.n_parameters},) or (n, "
-                f"{self.n_parameters}) for " + ", ".join(self.parameter_names)
-            )
-        return vectors
-
-    def _arguments(self, vectors: Floats) -> tuple[Floats, Floats, Floats]:
-        """Distortion coefficients, source nuisances and background coefficients, one row a parameter vector."""
-        nuisances = np.zeros((len(vectors), len(SOURCE_NUISANCES)))
-        background = np.zeros((len(vectors), len(BACKGROUND_TERMS)))
-        nuisances[:, SOURCE_NUISANCES.index("flux_scale")] = 1.0
-        nuisances[:, SOURCE_NUISANCES.index("psf_sigma")] = self.model.psf.sigma
-        for values, names in ((nuisances, SOURCE_NUISANCES), (background, BACKGROUND_TERMS)):
-            for k, name in enumerate(names):
-                if name in self.parameter_names:
-                    values[:, k] = vectors[:, self.parameter_names.index(name)]
-        background[:, 0] += self.noise.shift
-        d = self.model.polynomial
-        theta = d.monomial_coefficients(vectors[:, : d.n_terms])
-        return np.ascontiguousarray(theta), nuisances, background
-
-    @contextmanager
-    def _workspace(self) -> Iterator[Workspace]:
-        """A workspace that no other thread uses meanwhile."""
-        try:
-            workspace = self._workspaces.get_nowait()
-        except queue.Empty:
-            typical = self._arguments(self.start()[None])[1][0]
-            workspace = new_workspace(self._optics, typical, self._free)
-        yield workspace
-        self._workspaces.put(workspace)
-
-    @contextmanager
-    def _drawn(self, arguments: list[Floats]) -> Iterator[tuple[Workspace, Drawn]]:
-        """A workspace in which the sources are drawn, for one set of arguments."""
-        with self._workspace() as w:
-            yield w, draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
-            clear(w)
+        return self.likelihood.fluxes(self._vector(params))
 
     @cached_property
-    def _workspaces(self) -> "queue.SimpleQueue[Workspace]":
-        return queue.SimpleQueue()
-
-    @cached_property
-    def _order(self) -> list[int]:
-        """Where each parameter stands among source parameters followed by background coefficients."""
-        kernel = (
-            *self.model.distortion.names,
-            *self.nuisances.source_names,
-            *self.nuisances.background_names,
-        )
-        return [kernel.index(name) for name in self.parameter_names]
-
-    @cached_property
-    def _log_prior(self) -> Callable[[Floats], Floats]:
+    def _log_prior(self) -> Any:
         return priors.log_density(self.prior)
 
-    @cached_property
-    def _optics(self) -> Optics:
-        narrowest = self.prior["psf_sigma"].ppf(1e-6) if self.nuisances.psf_sigma else None
-        return self.model.optics(narrowest)
+    def _vector(self, params: npt.ArrayLike) -> Floats:
+        """One parameter vector; several are refused."""
+        vector = np.asarray(params, dtype=np.float64)
+        if vector.shape != (self.n_parameters,):
+            raise self._wrong_shape(params, f"one vector of shape ({self.n_parameters},)")
+        return vector
 
-    @cached_property
-    def _basis(self) -> Basis:
-        return self.model.basis(
-            [name for name in self.nuisances.source_names if name != "position_scatter"]
-        )
-
-    @property
-    def _flux(self) -> Floats:
-        return self.model.sources.flux
-
-    @property
-    def _free(self) -> Literal[True] | None:
-        return (
-            True if self.nuisances.flux == "free" else None
-        )  # what None leaves out is not compiled
-
-    @cached_property
-    def _frame(self) -> Counts:
-        ny, nx = self.model.detector.shape
-        values = np.full((ny, stride(nx)), MASKED)
-        values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, MASKED)
-        used = (values > LIMIT).reshape(-1, SEGMENT)
-        clean = np.where(used, values.reshape(-1, SEGMENT), 0.0)
-        total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
-        return Counts(
-            values.ravel(), used.sum(axis=1).astype(float), total, squares,
-            float(used.sum()), float(total.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
-        )  # fmt: skip
-
-    @cached_property
-    def _constant(self) -> float:
-        """The part of the log-likelihood that depends on the counts alone."""
-        if isinstance(self.noise, BackgroundNoise):
-            return 0.0
-        return -float(
-            np.sum(gammaln(np.maximum(self.counts[self.mask] + self.noise.shift, 0.0) + 1.0))
-        )
+    def _wrong_shape(self, params: npt.ArrayLike, expected: str) -> InputError:
+        names = ", ".join(self.parameter_names)
+        return InputError(f"params: got shape {np.shape(params)}, expected {expected} for {names}")
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}

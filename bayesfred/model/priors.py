@@ -1,9 +1,9 @@
-"""Priors: frozen scipy.stats distributions by parameter name, with the derivatives that scipy does not give.
+"""Priors: frozen scipy.stats distributions by parameter name, with their derivatives.
 
 The optimiser needs the slope and the curvature of every log-density, in closed form, and the
 sampler the log-densities themselves at less than scipy's price, which is a fifth of a likelihood;
-`DENSITIES` lists the families for which they are known. Default priors are weak: see
-`default_prior`.
+`DENSITIES` lists the families for which they are known. The default
+priors, which are weak, are in the table of `parameters`.
 """
 
 import math
@@ -16,8 +16,6 @@ from scipy.special import xlogy
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.detector import Detector
-from bayesfred.imaging.distortion import PolynomialDistortion
 
 # log p up to a constant, d log p / dz and -d^2 log p / dz^2 in the standardised z = (x - loc) /
 # scale; s are the shape parameters.
@@ -132,54 +130,3 @@ def slope(distribution: Any, x: float) -> tuple[float, float]:
     shapes, loc, scale = _standard(distribution)
     _, first, second = DENSITIES[distribution.dist.name](np.array((x - loc) / scale), shapes)
     return float(first) / scale, float(second) / scale**2
-
-
-def default_prior(
-    name: str,
-    distortion: PolynomialDistortion,
-    detector: Detector,
-    level: float,
-    sigma: float,
-) -> Any:
-    """The prior of a parameter for which the user gave none.
-
-    A distortion coefficient is normal with the scale at which its term moves a star anywhere in the
-    frame by at most 10 % of the half-width along each axis, and so are the pointing offsets; the
-    background is half-normal with ten times the frame's level, its slopes normal with that level; a
-    common flux factor is log-normal by a factor e; the PSF's width is normal around the reference
-    width by 30 %, cut at 0.6 and 2 times it. The scatter of the sources' positions is Gamma(2) with
-    a mean of a fifth of that width: a density that vanishes at 0 keeps the maximum off that
-    boundary and costs little where the frame tells otherwise.
-
-    Parameters
-    ----------
-    name : str
-    distortion : PolynomialDistortion
-    detector : Detector
-    level : float, counts per pixel
-        Typical level of the frame's counts.
-    sigma : float, pixel
-        Width of the reference PSF.
-
-    References
-    ----------
-    Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters in
-    multilevel models", Psychometrika 78 (2013): the gamma prior.
-    """
-    ny, nx = detector.fine_shape
-    half = {"f": 0.5 * nx, "g": 0.5 * ny}
-    if name in distortion.names:
-        largest = distortion.largest_displacement(half["f"], half["g"])
-        f, g = largest[:, distortion.names.index(name)]
-        return stats.norm(0.0, 0.1 / max(f / half["f"], g / half["g"]))
-    if name.startswith("offset"):
-        return stats.norm(0.0, 0.1 * half["f" if name == "offset_x" else "g"])
-    if name == "background":
-        return stats.halfnorm(0.0, 10.0 * level)
-    if name == "flux_scale":
-        return stats.lognorm(1.0)
-    if name == "psf_sigma":
-        return stats.truncnorm(-0.4 / 0.3, 1.0 / 0.3, loc=sigma, scale=0.3 * sigma)
-    if name == "position_scatter":
-        return stats.gamma(2.0, scale=0.1 * sigma)
-    return stats.norm(0.0, level)

@@ -25,7 +25,8 @@ class MapEstimate:
     n_evaluations : int
         Log-posteriors evaluated.
     message : str
-        How the search ended and where it began; what to do where it was not found, or the model does not fit.
+        How the search ended and where it began; what to do where it found no maximum, or the
+        model does not fit.
     at_maximum : bool
         Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits;
         of parameters at a bound of their prior it may point out of the support.

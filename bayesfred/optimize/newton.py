@@ -1,11 +1,11 @@
-"""One climb to a maximum of a posterior, from a given start.
+"""One search for a maximum of a density, from a given start.
 
 The Fisher information plus the prior's curvature is positive definite everywhere. Newton steps with
 it in the place of the Hessian go far and converge fast where the model fits. Where it does not,
 they overshoot or crawl; there scipy's BFGS takes over, in coordinates in which that matrix is the
 identity, and learns from gradients alone how the Hessian differs from it. Where the map folds there
-is no density; the search meets the bowl that its start predicts instead. Where a prior ends, a
-Newton step goes to the highest point, within the prior's support, of the paraboloid that it climbs.
+is no density; the search meets the paraboloid that its start predicts instead. Where a prior ends,
+a Newton step goes to the highest point, within the prior's support, of the paraboloid at hand.
 Where that step vanishes is the maximum, inside the support or at its edge, where the gradient
 points out of it.
 """
@@ -15,21 +15,21 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, optimize
 
-from bayesfred._typing import Floats
-from bayesfred.model.posterior import Posterior
+from bayesfred._typing import Flags, Floats
+from bayesfred.model.protocol import TargetDensity
 
-# standard deviations from the maximum, where log_prob differs from it by 5e-8; sums over frames
-# round at 1e-9
+# Standard deviations from the maximum at which the search ends. There log_prob differs from the
+# maximum by 5e-8; sums over frames round at 1e-9.
 CLOSE_ENOUGH = 3e-4
-NEAR = 0.1  # ... where only so many steps are asked for
+NEAR = 0.1  # the same where the number of steps is limited
 MOST_EVALUATIONS = 300  # after which no more searches begin
-AS_PREDICTED = (
-    0.5  # a Newton step whose gain is what it predicts to within this part is followed by another
-)
+
+# A Newton step is followed by another if it gains what it predicts to within this part.
+AS_PREDICTED = 0.5
 
 
 class NewtonResult(NamedTuple):
-    """Where a climb ended.
+    """Where a search ended.
 
     Attributes
     ----------
@@ -51,18 +51,34 @@ class NewtonResult(NamedTuple):
     evaluations: int
 
 
+class _Step(NamedTuple):
+    """A Newton step and the coordinates in which its information is the identity."""
+
+    step: Floats  # (d,)
+    distance: float  # its length, standard deviations
+    predicted: float  # gain in log-probability
+    scale: Floats  # (d,)
+    scaled: Floats  # (d, d) the information of params / scale
+    covariance: Floats  # (d, d)
+
+
 def maximize(
-    posterior: Posterior, start: Floats, *, steps: int | None = None, fisher: Floats | None = None
+    posterior: TargetDensity,
+    start: Floats,
+    *,
+    steps: int | None = None,
+    information: Floats | None = None,
 ) -> NewtonResult:
-    """The maximum above a start at which the posterior has density, or where so many Newton steps towards it lead.
+    """Find the maximum above a start, or make so many Newton steps towards it.
 
     Parameters
     ----------
-    posterior : Posterior
+    posterior : TargetDensity
     start : ndarray, shape (d,)
+        With density.
     steps : int, optional
-    fisher : ndarray, shape (d, d), optional
-        The Fisher information at the start, where it is known already.
+    information : ndarray, shape (d, d), optional
+        `posterior.information` at the start, where it is known already.
 
     Returns
     -------
@@ -74,83 +90,75 @@ def maximize(
     """
     params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
     low, high = posterior.support
+    close_enough = CLOSE_ENOUGH if steps is None else NEAR
     while True:
-        gradient = posterior.gradient(params)
-        information = _information(posterior, params, gradient, fisher)
-        fisher = None
-        scale = 1.0 / np.sqrt(
-            np.diag(information)
-        )  # rows differ in scale by many orders of magnitude
+        if information is None:
+            information = posterior.information(params)
         try:
-            lower = linalg.cholesky(information * np.outer(scale, scale), lower=True)
+            newton = _newton_step(posterior, params, information)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
-            return NewtonResult(
-                params, value, np.full_like(information, np.nan), np.inf, evaluations
-            )
-        whiten = scale[:, None] * linalg.solve_triangular(lower, np.eye(scale.size), lower=True).T
-        slope = whiten.T @ gradient
-        step, length = whiten @ slope, slope
-        if np.any(params + step < low) or np.any(params + step > high):
-            bounds = ((low - params) / scale, (high - params) / scale)
-            shares = optimize.lsq_linear(lower.T, slope, bounds, method="bvls").x
-            step, length = scale * shares, lower.T @ shares
-        distance, predicted = (
-            float(np.linalg.norm(length)),
-            float(slope @ length - 0.5 * length @ length),
-        )
-        if (
-            distance < (CLOSE_ENOUGH if steps is None else NEAR)
-            or evaluations >= MOST_EVALUATIONS
-            or taken == steps
-        ):
+            unknown = np.full_like(information, np.nan)
+            return NewtonResult(params, value, unknown, np.inf, evaluations)
+        information = None
+        if newton.distance < close_enough or evaluations >= MOST_EVALUATIONS or taken == steps:
             break
         gain, taken = -np.inf, taken + 1
         for fraction in 0.5 ** np.arange(10):
-            there = np.clip(params + fraction * step, low, high)
+            there = np.clip(params + fraction * newton.step, low, high)
             gain = float(posterior.log_prob(there)) - value
             evaluations += 1
-            if gain > 0.0:
+            if 0.0 < gain < np.inf:
                 params, value = there, value + gain
                 break
-        if gain > 0.0 and (steps is not None or abs(gain / predicted - 1.0) < AS_PREDICTED):
+        gains = 0.0 < gain < np.inf
+        if gains and (steps is not None or abs(gain / newton.predicted - 1.0) < AS_PREDICTED):
             continue
         if steps is not None:
             break
-        inside = np.flatnonzero(
-            (low < params) & (params < high)
-        )  # the others stay at their bounds in this search
-        lower = linalg.cholesky(
-            (information * np.outer(scale, scale))[np.ix_(inside, inside)], lower=True
-        )
-        directions = np.zeros((params.size, inside.size))
-        directions[inside] = (
-            scale[inside, None] * linalg.solve_triangular(lower, np.eye(inside.size), lower=True).T
-        )
+        directions = _free_directions(newton, (low < params) & (params < high))
         result = _search(posterior, params, value, directions)
         evaluations += result.nfev
         if result.fun < 0.0:
             params, value = params + directions @ result.x, value - result.fun
-        elif not gain > 0.0:
+        elif not gains:
             break
-    return NewtonResult(
-        params, float(posterior.log_prob(params)), whiten @ whiten.T, distance, evaluations
-    )
+    log_prob = float(posterior.log_prob(params))
+    return NewtonResult(params, log_prob, newton.covariance, newton.distance, evaluations)
 
 
-def _information(
-    posterior: Posterior, params: Floats, gradient: Floats, fisher: Floats | None
+def _newton_step(posterior: TargetDensity, params: Floats, information: Floats) -> _Step:
+    """The step to the top of the paraboloid within the support; LinAlgError if it has none."""
+    low, high = posterior.support
+    gradient = posterior.gradient(params)
+    information = _at_edges(information, params, gradient, (low, high))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = 1.0 / np.sqrt(np.diag(information))  # rows differ by many orders of magnitude
+    scaled = information * np.outer(scale, scale)
+    if not np.isfinite(scaled).all():
+        raise linalg.LinAlgError
+    lower = linalg.cholesky(scaled, lower=True)
+    whiten = scale[:, None] * linalg.solve_triangular(lower, np.eye(scale.size), lower=True).T
+    slope = whiten.T @ gradient
+    step, length = whiten @ slope, slope
+    if np.any(params + step < low) or np.any(params + step > high):
+        bounds = ((low - params) / scale, (high - params) / scale)
+        shares = optimize.lsq_linear(lower.T, slope, bounds, method="bvls").x
+        step, length = scale * shares, lower.T @ shares
+    predicted = float(slope @ length - 0.5 * length @ length)
+    return _Step(step, float(np.linalg.norm(length)), predicted, scale, scaled, whiten @ whiten.T)
+
+
+def _at_edges(
+    information: Floats, params: Floats, gradient: Floats, support: tuple[Floats, Floats]
 ) -> Floats:
-    """Fisher information plus prior curvature, as far as it describes the posterior where a prior's support ends.
+    """The information as far as it describes the density where a prior's support ends.
 
     Where the background has no counts, the log-posterior falls linearly from its edge, while the
     information about it has no bound. A fall by exp(-g x) has the standard deviation 1/g; it stands
     for information that predicts less.
     """
-    information = posterior.information(params, fisher)
-    known = np.diag(information).copy()
-    room = np.where(
-        gradient < 0.0, params - posterior.support[0], posterior.support[1] - params
-    )  # towards which it climbs
+    information, known = information.copy(), np.diag(information).copy()
+    room = np.where(gradient < 0.0, params - support[0], support[1] - params)
     for k in np.flatnonzero((room * np.sqrt(known) <= 1.0) | (room <= 0.0)):
         if known[k] > gradient[k] ** 2 > 0.0:
             information[k], information[:, k] = 0.0, 0.0
@@ -158,19 +166,28 @@ def _information(
     return information
 
 
+def _free_directions(newton: _Step, is_inside: Flags) -> Floats:
+    """Whitened directions, shape (d, n), of the n parameters that are not at a bound."""
+    inside = np.flatnonzero(is_inside)
+    lower = linalg.cholesky(newton.scaled[np.ix_(inside, inside)], lower=True)
+    whiten = linalg.solve_triangular(lower, np.eye(inside.size), lower=True).T
+    directions = np.zeros((newton.scale.size, inside.size))
+    directions[inside] = newton.scale[inside, None] * whiten
+    return directions
+
+
 def _search(
-    posterior: Posterior, origin: Floats, value: float, whiten: Floats
+    posterior: TargetDensity, origin: Floats, value: float, directions: Floats
 ) -> optimize.OptimizeResult:
     """BFGS on what log_prob lacks of its value at the origin."""
 
     def cost(z: Floats) -> tuple[float, Floats]:
-        params = origin + whiten @ z
+        params = origin + directions @ z
         here = float(posterior.log_prob(params))
         if not np.isfinite(here):
             return 1.0 + 0.5 * float(z @ z), z
-        return value - here, -(whiten.T @ posterior.gradient(params))
+        return value - here, -(directions.T @ posterior.gradient(params))
 
     options = {"gtol": CLOSE_ENOUGH, "norm": 2, "maxiter": 100}
-    return optimize.minimize(
-        cost, np.zeros(whiten.shape[1]), jac=True, method="BFGS", options=options
-    )
+    start = np.zeros(directions.shape[1])
+    return optimize.minimize(cost, start, jac=True, method="BFGS", options=options)

@@ -2,17 +2,17 @@
 
 The page loads nothing from elsewhere and runs no script, so that it can be mailed, archived and
 opened years later. Text that comes from a user is escaped by the template engine.
-`bayesfred.analysis.diagnostics` supplies the numbers and `bayesfred.reporting.plots` the figures.
+`bayesfred.sampling.summary` and `bayesfred.analysis.diagnostics` supply the numbers; the figures
+are those of `bayesfred.reporting.frames` and `bayesfred.reporting.posteriors`.
 """
 
 import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -20,31 +20,35 @@ from matplotlib.figure import Figure
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.errors import printable
-from bayesfred.io.atomic import replace
+from bayesfred.io import atomic
+from bayesfred.io.summary_table import Table
+from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
-from bayesfred.reporting import plots
-from bayesfred.sampling.chainfile import Chain
+from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.labels import html_symbol, html_unit, scale_of
+from bayesfred.reporting.posteriors import corner_plot, trace_plot
+from bayesfred.reporting.style import png
+from bayesfred.sampling.chain import Chain
 
-__all__ = ["write_report"]
+__all__ = ["PageFigure", "page_figures", "write_report"]
+
+# digits after the point of what is dimensionless
+DIGITS = {
+    "rhat": 4,
+    "ess_bulk": 0,
+    "ess_tail": 0,
+    "tau": 2,
+    "prior_sensitivity": 3,
+    "likelihood_sensitivity": 3,
+}
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A parameter as the table prints it: all numbers of the row in one power of ten."""
+class PageFigure(NamedTuple):
+    """A figure of the page with what stands above and below it."""
 
-    symbol: Markup
-    unit: Markup
-    truth: str
-    estimate: str
-    mean: str
-    sd: str
-    z: str
-    rhat: str
-    ess_bulk: str
-    ess_tail: str
-    tau: str
-    prior: str
-    likelihood: str
+    heading: str
+    caption: str
+    figure: Figure
 
 
 @dataclass(frozen=True)
@@ -64,13 +68,13 @@ def write_report(
     *,
     title: str,
     chain: Chain,
+    summary: Table,
     diagnostics: Diagnostics,
-    posterior: Posterior,
-    truth: Floats | None = None,
+    figures: Sequence[PageFigure] = (),
     notes: Sequence[str] = (),
     settings: str | None = None,
 ) -> Path:
-    """Write the report of a run as one HTML file, in one step: a reader sees the old page or the new one.
+    """Write the report of a run as one HTML file, in one step: the old page stays until then.
 
     Parameters
     ----------
@@ -79,12 +83,13 @@ def write_report(
     title : str
         Heading of the page.
     chain : Chain
+    summary : Table
+        The parameters of `chain`, see `bayesfred.sampling.summary.summary`, with
+        `Diagnostics.columns`.
     diagnostics : Diagnostics
         What `diagnose` said of `chain`.
-    posterior : Posterior
-        The posterior that `chain` samples.
-    truth : ndarray, shape (d,), parameter units, optional
-        Values that a simulation used.
+    figures : sequence of PageFigure, optional
+        In the page's order.
     notes : sequence of str, optional
         Paragraphs of plain text.
     settings : str, optional
@@ -98,10 +103,9 @@ def write_report(
     Raises
     ------
     InputError
-        The page cannot be written.
+        If the page cannot be written.
     """
     path = Path(path)
-    draws = chain.draws()
     environment = Environment(
         loader=PackageLoader("bayesfred.reporting", ""),
         autoescape=True,
@@ -109,50 +113,39 @@ def write_report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    parameters = {p.name: p for p in chain.posterior().parameters}
     page = environment.get_template("template.html").render(
         title=title,
         diagnostics=diagnostics,
-        rows=_rows(chain, diagnostics, draws, truth),
-        prior_dominated=Markup(", ").join(_symbol(name) for name in diagnostics.prior_dominated),
-        has_truth=truth is not None,
+        rows=[_row(dict(row), parameters[row["name"]]) for row in summary],
+        prior_dominated=Markup(", ").join(
+            html_symbol(parameters[name]) for name in diagnostics.prior_dominated
+        ),
+        has_truth="truth" in summary.colnames,
         statistics=_statistics(diagnostics),
-        figures=_figures(chain, posterior, draws, truth),
+        figures=[(f.heading, f.caption, _data_uri(f.figure)) for f in figures],
         provenance=_provenance(chain, diagnostics),
         notes=notes,
         settings=settings,
     )
-    replace(path, page.encode())
+    atomic.replace(path, page.encode())
     return path
 
 
-def _rows(
-    chain: Chain, diagnostics: Diagnostics, draws: Floats, truth: Floats | None
-) -> list[_Row]:
-    rows = []
-    for k, name in enumerate(chain.parameter_names):
-        mean, sd = float(draws[:, k].mean()), float(draws[:, k].std())
-        estimate = float(chain.estimate.params[k])
-        true = None if truth is None else float(truth[k])
-        exponent, decimals = _scale(mean, sd)
-        z = "" if true is None else _z(mean - true, sd)
-        rows.append(
-            _Row(
-                _symbol(name),
-                _unit(name, exponent),
-                _number(true, exponent, decimals),
-                _number(estimate, exponent, decimals),
-                _number(mean, exponent, decimals),
-                _number(sd, exponent, decimals),
-                z,
-                f"{diagnostics.rhat[name]:.4f}",
-                f"{diagnostics.ess_bulk[name]:.0f}",
-                f"{diagnostics.ess_tail[name]:.0f}",
-                f"{diagnostics.tau[name]:.2f}",
-                f"{diagnostics.prior_sensitivity[name]:.3f}",
-                f"{diagnostics.likelihood_sensitivity[name]:.3f}",
-            )
-        )
-    return rows
+def _row(values: dict[str, Any], parameter: Parameter) -> dict[str, str]:
+    """One parameter's cells by column of the summary, its numbers in one power of ten."""
+    scale = scale_of(values["mean"], values["sd"])
+    cells: dict[str, str] = {
+        key: _minus(scale.number(values[key]))
+        for key in ("truth", "MAP", "mean", "sd")
+        if key in values
+    }
+    cells |= {
+        "symbol": html_symbol(parameter),
+        "unit": html_unit(parameter, scale.exponent),
+        "z": _z(values["z"]) if "z" in values else "",
+    }
+    return cells | {key: f"{values[key]:.{digits}f}" for key, digits in DIGITS.items()}
 
 
 def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
@@ -182,53 +175,64 @@ def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
 
 def _statistic(name: str, value: float, expected: float, sd: float, meaning: str) -> _Statistic:
     return _Statistic(
-        name, f"{value:.1f}", f"{expected:.1f}", f"{sd:.1f}", _z(value - expected, sd), meaning
+        name,
+        f"{value:.1f}",
+        f"{expected:.1f}",
+        f"{sd:.1f}",
+        _z((value - expected) / sd if sd > 0 else math.nan),
+        meaning,
     )
 
 
-def _figures(
-    chain: Chain, posterior: Posterior, draws: Floats, truth: Floats | None
-) -> list[tuple[str, str, str]]:
-    """Heading, caption and data URI of each figure."""
-    counts, mask = posterior.counts, posterior.mask
-    expected = posterior.expected_counts(chain.estimate.params)
-    sigma = posterior.sigma(chain.estimate.params)
+def page_figures(
+    fitted: FittedFrame, chain: Chain, *, truth: Floats | None = None
+) -> list[PageFigure]:
+    """The figures of a run's page.
+
+    Parameters
+    ----------
+    fitted : FittedFrame
+        The frame with the model at the MAP.
+    chain : Chain
+    truth : ndarray, shape (d,), parameter units, optional
+        Values that a simulation used.
+
+    Returns
+    -------
+    list of PageFigure
+    """
+    posterior = chain.posterior()
     u, v, half_width = _star_positions(chain, posterior)
     return [
-        (
+        PageFigure(
             "Frame, model and residual",
             "At the MAP. Grey pixels do not enter the likelihood.",
-            _data_uri(plots.frame_triptych(counts, expected, sigma, mask)),
+            frame_triptych(fitted),
         ),
-        (
+        PageFigure(
             "Brightest sources",
             "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced "
             "source.",
-            _data_uri(
-                plots.star_panels(counts, expected, sigma, mask, u, v, half_width=half_width)
-            ),
+            star_panels(fitted, u, v, half_width=half_width),
         ),
-        (
+        PageFigure(
             "Posterior",
             "Contours hold 39 % and 86 % of the draws.",
-            _data_uri(
-                plots.corner_plot(
-                    draws, chain.parameter_names, truth=truth, estimate=chain.estimate.params
-                )
+            corner_plot(
+                chain.draws(), posterior.parameters, truth=truth, estimate=chain.estimate.params
             ),
         ),
-        (
+        PageFigure(
             "Chain",
             "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
-            "at 1 when "
-            "all ensembles draw from one distribution.",
-            _data_uri(plots.trace_plot(chain)),
+            "at 1 when all ensembles sample one distribution.",
+            trace_plot(chain, posterior.parameters),
         ),
     ]
 
 
 def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats, int]:
-    """Where the model puts the sources, in recorded pixels from the middle, and a stamp's half-width."""
+    """Images of the sources in recorded pixels from the middle, and a stamp's half-width."""
     model = posterior.model
     params = dict(zip(chain.parameter_names, chain.estimate.params, strict=True))
     theta = chain.estimate.params[: model.distortion.n_terms]
@@ -261,56 +265,16 @@ def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]
 
 
 def _data_uri(figure: Figure) -> str:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", facecolor="white")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return "data:image/png;base64," + base64.b64encode(png(figure, dpi=100)).decode("ascii")
 
 
-def _scale(value: float, sd: float) -> tuple[int, int]:
-    """Power of ten of a row, and the decimals that give its uncertainty two digits."""
-    exponent = plots.power_of_ten(np.array([value, sd]))
-    if not 0.0 < sd < math.inf:
-        return exponent, 6
-    digits = math.floor(math.log10(sd) + 1e-12)
-    # 0.0996 would round to 0.100: three digits
-    if round(sd / 10.0 ** (digits - 1)) == 100:
-        digits += 1
-    return exponent, max(0, 1 - digits + exponent)
+def _minus(number: str) -> str:
+    return number.replace("-", "−")
 
 
-def _number(value: float | None, exponent: int, decimals: int) -> str:
-    return "" if value is None else f"{value / 10.0**exponent:.{decimals}f}".replace("-", "−")
-
-
-def _z(difference: float, sd: float) -> str:
-    return f"{difference / sd:+.2f}".replace("-", "−") if sd > 0.0 else ""
+def _z(value: float) -> str:
+    return _minus(f"{value:+.2f}") if math.isfinite(value) else ""
 
 
 def _general(value: float) -> str:
     return f"{value:.5g}" if math.isfinite(value) else "not defined"
-
-
-def _symbol(name: str) -> Markup:
-    """A parameter's name with its powers raised."""
-    term = plots.parameter_powers(name)
-    if term is None:
-        return Markup("{}").format(name.replace("_", " "))
-    powers = Markup("").join(
-        Markup("{}").format(variable)
-        if power == 1
-        else Markup("{}<sup>{}</sup>").format(variable, power)
-        for variable, power in term[1]
-    )
-    letter = Markup("<i>{}</i>").format(term[0]) if len(term[0]) == 1 else term[0]
-    return Markup("{}<sub>{}</sub>").format(letter, powers)
-
-
-def _unit(name: str, exponent: int) -> Markup:
-    """Power of ten and unit of a row."""
-    word, pixels = plots.parameter_unit(name)
-    parts = [Markup("10<sup>{}</sup>").format(str(exponent).replace("-", "−"))] if exponent else []
-    parts += [Markup("{}").format(word)] if word else []
-    if pixels:
-        power = Markup("<sup>{}</sup>").format(str(pixels).replace("-", "−")) if pixels != 1 else ""
-        parts.append(Markup("px{}").format(power))
-    return Markup(" ").join(parts)

@@ -9,86 +9,24 @@ read, and `io.serialize` stores the objects in it.
 
 import hashlib
 import io
-import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import arviz_base
 import h5py
 import numpy as np
-import xarray as xr
 
-from bayesfred._typing import Floats, Ints, PathLike
+from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.atomic import replace
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
 from bayesfred.io.serialize import read, write, write_array
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.chain import Chain
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
-
-
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """A run's draws and where they came from.
-
-    Attributes
-    ----------
-    path : Path
-        The chain file.
-    parameter_names : tuple of str, length d
-    chain : ndarray, shape (n_ensembles, n_steps, n_walkers, d)
-        Positions after every step, burn-in included.
-    log_prob : ndarray, shape (n_ensembles, n_steps, n_walkers)
-    accepted : ndarray, shape (n_ensembles, n_walkers)
-        Moves accepted so far.
-    burn_in : int
-        Steps that `draws` leaves out; half of all, or more, while the run goes on.
-    seed : int
-    estimate : MapEstimate
-        The maximum that the proposals are centred on.
-    versions : dict of str to str
-        Packages that the run was made with.
-    target_ess : float
-        Effective draws that were asked for.
-    n_invalid : int
-        Log-probabilities that came out as NaN or +inf and were taken as -inf.
-    """
-
-    path: Path
-    parameter_names: tuple[str, ...]
-    chain: Floats
-    log_prob: Floats
-    accepted: Ints
-    burn_in: int
-    seed: int
-    estimate: MapEstimate
-    versions: dict[str, str]
-    target_ess: float = 1000.0
-    n_invalid: int = 0
-
-    def draws(self) -> Floats:
-        """All draws after burn-in, shape (n, d)."""
-        return self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
-
-    def to_datatree(self) -> xr.DataTree:
-        """The draws after burn-in for arviz: every walker of every ensemble is a chain."""
-        kept = self.chain[:, self.burn_in :].swapaxes(1, 2)
-        kept = kept.reshape(-1, *kept.shape[2:])
-        log_prob = self.log_prob[:, self.burn_in :].swapaxes(1, 2).reshape(kept.shape[:2])
-        posterior = {name: kept[..., k] for k, name in enumerate(self.parameter_names)}
-        with warnings.catch_warnings():  # many short chains are what an ensemble is
-            warnings.filterwarnings("ignore", message="Found chain dimension to be longer")
-            return arviz_base.from_dict({"posterior": posterior, "sample_stats": {"lp": log_prob}})
-
-    def posterior(self) -> Posterior:
-        """The posterior that was sampled, rebuilt from the file."""
-        with open_checked(self.path) as file:
-            return read(file["posterior"], Posterior)
 
 
 def open_chain(path: PathLike) -> Chain:
@@ -119,55 +57,40 @@ def open_chain(path: PathLike) -> Chain:
         return _read(Path(path), file)
 
 
-def random_states(path: Path) -> list[tuple[Any, ...]]:
-    """The state of every ensemble's random numbers after its last step."""
-    with open_checked(path) as file:
-        return [
-            _random_state(file[f"ensemble_{k}"].attrs) for k in range(int(file.attrs["ensembles"]))
-        ]
-
-
-def fingerprint(posterior: Posterior) -> dict[str, str]:
-    """A hash of each part of a posterior, to tell whether a chain belongs to it."""
-    with h5py.File("fingerprint", "w", driver="core", backing_store=False) as file:
-        write(file, posterior)
-        return _digests(file)
-
-
-def changed_parts(path: Path, posterior: Posterior) -> list[str]:
-    """Which parts of a posterior are not those that a chain file holds."""
-    with open_checked(path) as file:
-        stored = _digests(file["posterior"])
-    return [name for name, digest in fingerprint(posterior).items() if stored.get(name) != digest]
-
-
-def check_same_posterior(path: Path, posterior: Posterior) -> None:
-    """Refuse a chain file whose frame, model, noise or priors are not those of the posterior."""
-    changed = changed_parts(path, posterior)
-    if changed:
-        raise InputError(
-            f"{path}: the run was made with other {', '.join(changed)}, expected the same to "
-            "resume: write to another file or "
-            "start over with overwrite"
-        )
-
-
-def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, ...]]) -> None:
-    """Replace the chain's file by one that holds its present state.
-
-    Parameters
-    ----------
-    chain : Chain
-    posterior : Posterior
-        What was sampled.
-    states : sequence of tuple
-        The state of every ensemble's random numbers.
+def fingerprint(posterior: TargetDensity) -> dict[str, str]:
+    """A hash of each part of a posterior as files hold it.
 
     Raises
     ------
     InputError
-        The file cannot be written.
+        If no file can hold such a posterior.
     """
+    with h5py.File(io.BytesIO(), "w") as file:  # without a name that other threads could use
+        write(file, posterior)
+        return _digests(file)
+
+
+def stored_fingerprint(path: Path) -> dict[str, str]:
+    """The hashes of the parts of the posterior in a chain file, without rebuilding it."""
+    with open_checked(path) as file:
+        return _digests(file["posterior"])
+
+
+def changed_parts(before: dict[str, str], after: dict[str, str]) -> list[str]:
+    """The parts whose hashes are not those of an earlier fingerprint."""
+    return [name for name, digest in after.items() if before.get(name) != digest]
+
+
+def write_chain(chain: Chain) -> None:
+    """Replace the chain's file by one that holds its present state.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written, or cannot hold such a posterior.
+    """
+    if chain.path is None:
+        raise ValueError("a chain in memory has no file")
     content = io.BytesIO()  # so that a full disk meets plain writing, not HDF5 halfway through
     with h5py.File(content, "w", libver=FORMAT) as file:
         file.attrs.update(
@@ -183,9 +106,9 @@ def write_chain(chain: Chain, posterior: Posterior, states: Sequence[tuple[Any, 
         versions.attrs.update(
             {name: np.bytes_(version) for name, version in chain.versions.items()}
         )
-        write(file.create_group("posterior"), posterior)
+        write(file.create_group("posterior"), chain.density)
         write(file.create_group("estimate"), chain.estimate)
-        for k, state in enumerate(states):
+        for k, state in enumerate(chain.random_states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
     with content.getbuffer() as written:
         try:
@@ -214,39 +137,37 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
 def _read(path: Path, file: h5py.File) -> Chain:
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     chain = Chain(
-        path,
-        tuple(name.decode() for name in file.attrs["parameter_names"]),
-        np.stack([g["chain"][()] for g in groups]),
-        np.stack([g["log_prob"][()] for g in groups]),
-        np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
-        int(file.attrs["burn_in"]),
-        int(file.attrs["seed"]),
-        read(file["estimate"], MapEstimate),
-        {name: version.decode() for name, version in file["versions"].attrs.items()},
-        float(file.attrs["target_ess"]),
-        int(file.attrs["n_invalid"]),
+        path=path,
+        density=read(file["posterior"], Posterior),
+        chain=np.stack([g["chain"][()] for g in groups]),
+        log_prob=np.stack([g["log_prob"][()] for g in groups]),
+        accepted=np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
+        random_states=tuple(_random_state(g.attrs) for g in groups),
+        burn_in=int(file.attrs["burn_in"]),
+        seed=int(file.attrs["seed"]),
+        estimate=read(file["estimate"], MapEstimate),
+        versions={name: version.decode() for name, version in file["versions"].attrs.items()},
+        target_ess=float(file.attrs["target_ess"]),
+        n_invalid=int(file.attrs["n_invalid"]),
     )
-    d, shape = len(chain.parameter_names), chain.chain.shape
-    arrays = (
-        chain.chain,
-        chain.log_prob,
-        chain.accepted,
-        chain.estimate.params,
-        chain.estimate.covariance,
-    )
-    if [a.shape for a in arrays] != [
-        (*shape[:3], d),
-        shape[:3],
-        (shape[0], shape[2]),
-        (d,),
-        (d, d),
-    ] or 0 in shape:
-        raise ValueError("shapes that do not agree")
-    if {int(g.attrs["iteration"]) for g in groups} != {shape[1]} or not 0 <= chain.burn_in < shape[
-        1
-    ]:
+    names = tuple(name.decode() for name in file.attrs["parameter_names"])
+    if names != chain.parameter_names:
+        raise ValueError("names of parameters that are not the posterior's")
+    d, shape = len(names), chain.chain.shape
+    expected = {
+        "chain": (chain.chain, (*shape[:3], d)),
+        "log_prob": (chain.log_prob, shape[:3]),
+        "accepted": (chain.accepted, (shape[0], shape[2])),
+        "params": (chain.estimate.params, (d,)),
+        "covariance": (chain.estimate.covariance, (d, d)),
+    }
+    wrong = [name for name, (array, right) in expected.items() if array.shape != right]
+    if wrong or 0 in shape:
+        raise ValueError(f"shapes that do not agree: {', '.join(wrong)}")
+    steps = {int(g.attrs["iteration"]) for g in groups}
+    if steps != {shape[1]} or not 0 <= chain.burn_in < shape[1]:
         raise ValueError("numbers of steps that do not agree")
-    if not all(name.isidentifier() for name in (*chain.parameter_names, *chain.versions)):
+    if not all(name.isidentifier() for name in chain.versions):
         raise ValueError("names that are none")
     if not all(text.isprintable() for text in (chain.estimate.message, *chain.versions.values())):
         raise ValueError("texts that cannot be shown")

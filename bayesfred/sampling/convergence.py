@@ -103,7 +103,9 @@ def effective_size(series: Floats) -> float:
 
 
 def rank_rhat(chains: Floats) -> float:
-    """Rank-normalised split R-hat, the larger of that of the draws and of their distance from the median.
+    """Rank-normalised split R-hat, of the draws or of their distances from the median.
+
+    The larger of the two is returned.
 
     Parameters
     ----------
@@ -164,8 +166,8 @@ def rhats(chain: Floats) -> Floats:
 def effective_sizes(chain: Floats) -> tuple[Floats, Floats]:
     """Bulk and tail effective sample sizes of every parameter, as in `convergence`.
 
-    Each walker is a chain. That walkers of an ensemble lean on each other's positions is not in
-    them; measured on a normal target in 13 dimensions, for stretch and differential evolution
+    Each walker is a chain. That walkers of an ensemble depend on each other is not counted;
+    measured on a normal target in 13 dimensions, for stretch and differential evolution
     moves, it changes them by no more than 10 %.
     """
     tail = np.zeros(chain.shape[3])
@@ -187,7 +189,10 @@ def bulk_sizes(chain: Floats) -> Floats:
 
 
 def _walkers(chain: Floats) -> Iterator[tuple[int, Floats]]:
-    """Every parameter whose draws are finite and enough, and its walkers as chains, shape (n_chains, n_steps)."""
+    """Every parameter with enough draws, all finite, and its walkers as chains.
+
+    Their shape is (n_chains, n_steps).
+    """
     _, n_steps, n_walkers, d = chain.shape
     for k in range(d) if n_steps * n_walkers >= 4 else ():
         walkers = (

@@ -1,11 +1,11 @@
 """Ensembles of walkers: where they start, and their steps, which emcee makes.
 
-What an ensemble may meet is settled here: a log-probability that is no number, walkers that cannot
-start a run, walkers that are stuck, and proposals that are hardly ever accepted. These are made
-anew from the draws so far, at a few steps fixed beforehand. What they are made of stands in the
-chain, so that a run that goes on makes the same ones; and from the last time on they are fixed, so
-that the draws after it come from a Markov chain that leaves the posterior alone. The draws before
-it are left out.
+This module deals with what an ensemble may meet: a log-probability that is not a number, walkers
+from which no run can start, walkers that are stuck, and proposals that are hardly ever accepted.
+Such proposals are adapted to the draws so far, at a few steps fixed beforehand. Everything they
+depend on is in the chain, so a resumed run adapts in the same way. After the last time they are
+fixed, so that the draws from there on come from a Markov chain that leaves the posterior invariant.
+The draws before it are left out.
 
 References
 ----------
@@ -26,11 +26,11 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
-# share of accepted moves below which proposals are made anew; half of them by differential
-# evolution bring 0.15 alone
+# share of accepted moves below which proposals are adapted; differential evolution alone, when it
+# makes half of them, brings 0.15
 POOR = 0.3
-LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which it is looked at, over the latter half of them
-DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be made anew
+LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which this is checked, over the latter half of them
+DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be adapted
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
 # share of the largest spread, in standard deviations, below which there is none in a direction
 DEPENDENT = 1e-8
@@ -55,7 +55,7 @@ class Step(NamedTuple):
         return cls(coords, log_prob, accepted, [s.random_state for s in states], n_invalid)
 
     def states(self) -> list[emcee.State]:
-        """The ensembles for emcee to go on with."""
+        """The ensembles as emcee takes them."""
         parts = zip(self.coords, self.log_prob, self.random, strict=True)
         return [
             emcee.State(coords, log_prob=log_prob, random_state=random)
@@ -64,7 +64,10 @@ class Step(NamedTuple):
 
 
 class _LogProb:
-    """The log-posterior as emcee gets it: NaN and +inf, which are no densities, become -inf and are counted."""
+    """The log-posterior for emcee: NaN and +inf, which are no densities, become -inf.
+
+    They are counted.
+    """
 
     def __init__(self, posterior: TargetDensity, n_invalid: int) -> None:
         self.posterior, self.n_invalid = posterior, n_invalid
@@ -121,7 +124,7 @@ def begin(
 
 
 def check_start(names: tuple[str, ...], start: Step) -> None:
-    """Refuse ensembles from which no run can go on.
+    """Refuse ensembles from which no run can start or be resumed.
 
     Parameters
     ----------
@@ -132,8 +135,8 @@ def check_start(names: tuple[str, ...], start: Step) -> None:
     Raises
     ------
     InputError
-        If a walker has no posterior density, or the walkers of an ensemble do not spread in every
-        direction that so many can.
+        If a walker has no posterior density, or the walkers of an ensemble do not spread in as
+        many directions as their number allows.
     """
     lost = int(np.sum(~(np.isfinite(start.coords).all(axis=2) & np.isfinite(start.log_prob))))
     if lost:
@@ -167,29 +170,35 @@ def check_start(names: tuple[str, ...], start: Step) -> None:
 
 
 def adapted(chain: Floats) -> int:
-    """Steps after which the proposals in use were made, 0 for those of the Laplace approximation.
+    """The step after which proposals were adapted last, 0 for those of the Laplace approximation.
 
     Parameters
     ----------
     chain : ndarray, shape (ensembles, steps, walkers, d)
     """
-    made = 0
-    for look in LOOKS:
-        if (
-            look <= chain.shape[1]
-            and np.any(np.diff(chain[:, look // 2 : look], axis=1) != 0.0, axis=3).mean() < POOR
-        ):
-            made = look
-    return made
+    looks = [look for look in LOOKS if look <= chain.shape[1] and _accepted(chain, look) < POOR]
+    return max(looks, default=0)
 
 
-def _moves(
+def _accepted(chain: Floats, look: int) -> float:
+    """Share of accepted moves in the latter half of the steps before a look."""
+    moved = np.any(np.diff(chain[:, look // 2 : look], axis=1) != 0.0, axis=3)
+    return float(moved.mean())
+
+
+def moves_after(
     posterior: TargetDensity, estimate: MapEstimate, chain: Floats
 ) -> list[tuple[emcee.moves.Move, float]]:
     """The moves that make the step after those in the chain, each with its share.
 
-    Differential evolution frees walkers that stand where they are hardly ever proposed a likelier
-    place. That shows in time: before the first look it would only cost draws.
+    Differential evolution frees walkers from positions where a likelier one is hardly ever
+    proposed. That matters in the long run only: before the first look it would only cost draws.
+
+    Parameters
+    ----------
+    posterior : TargetDensity
+    estimate : MapEstimate
+    chain : ndarray, shape (ensembles, steps, walkers, d)
     """
     move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= LOOKS[0])
     if made := adapted(chain):
@@ -205,16 +214,16 @@ def _moves(
 def advance(
     posterior: TargetDensity, estimate: MapEstimate, start: Step, steps: Sequence[Step] = ()
 ) -> Iterator[Step]:
-    """Step all ensembles in turn, without end; a step is one when every ensemble has made it.
+    """Step all ensembles in turn, without end; a step is complete when all have made it.
 
     Parameters
     ----------
-    posterior : Posterior
+    posterior : TargetDensity
     estimate : MapEstimate
     start : Step
         From `begin`.
     steps : sequence of Step
-        Those made already.
+        The steps that were made already.
 
     Raises
     ------
@@ -228,7 +237,7 @@ def advance(
     idle = np.zeros(last.log_prob.shape, np.int64)  # steps since each walker moved
     while True:
         if not generators or len(past) in LOOKS:
-            moves = _moves(
+            moves = moves_after(
                 posterior,
                 estimate,
                 np.array(past).reshape(-1, ensembles, walkers, d).swapaxes(0, 1),

@@ -2,7 +2,7 @@
 
 `LaplaceMove` proposes from the Laplace approximation, independently of where a walker stands. Where
 the posterior is close to Gaussian, as it is for frames with enough photons, nearly every proposal
-is accepted and a draw is worth almost an independent one; `sampling.py` mixes it with differential
+is accepted and a draw is worth almost an independent one. `ensembles` mixes it with differential
 evolution for posteriors that are not.
 """
 
@@ -23,7 +23,7 @@ from bayesfred.optimize.estimate import MapEstimate, inverse
 HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
 
-NESTED = 30  # at most so many approximations to either side
+NESTED = 30  # approximations to either side, at most
 NEGLIGIBLE = 7.0  # in log weight below the largest: e^-7 = 1e-3
 
 NEAR = 6.0  # standard deviations from the mean within which a bound of the prior counts
@@ -95,8 +95,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         low, high = (np.broadcast_to(bound, d) for bound in support)
         try:
             covariances = np.reshape(covariance, (-1, d, d))
-            reach = NEAR * np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
-            near = np.any((means - low < reach) | (high - means < reach), axis=0)
+            margin = NEAR * np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
+            near = np.any((means - low < margin) | (high - means < margin), axis=0)
             self.order = np.argsort(~near, kind="stable")  # parameters near a bound first
             self.lowers = np.array(
                 [cholesky(c[np.ix_(self.order, self.order)], lower=True) for c in covariances]
@@ -114,13 +114,19 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     def of(cls, posterior: TargetDensity, estimate: MapEstimate) -> "LaplaceMove":
         """The move for a posterior, given its maximum.
 
-        The scatter tau of the sources' positions sets the errors of all that is measured from
-        positions, so that one Gaussian for all its values is a poor approximation. It is nested
-        then: for values tau_k in a geometric series, half an error apart and reaching to either
-        side as far as there is weight (the mean lies above the maximum, as for any scatter about a
-        fit), the other parameters have their Laplace approximation given tau_k, one Newton step
-        from the estimate. The k-th weight is proportional to the posterior there times the root of
-        the determinant of the covariance, that of tau being the squared distance between the tau_k.
+        A hyperparameter tau, such as the scatter of the sources' positions, sets the errors of
+        other parameters, so that one Gaussian for all its values is a poor approximation. The
+        approximation is nested then. Its values tau_k are a geometric series, half an error apart,
+        which extends to either side as far as there is weight (the mean lies above the maximum, as
+        for any scatter about a fit). Given tau_k the other parameters have their Laplace
+        approximation, one Newton step from the estimate. The k-th weight is proportional to the
+        posterior there times the root of the determinant of the covariance, in which the variance
+        of tau is the squared distance between the tau_k.
+
+        Raises
+        ------
+        InputError
+            If the posterior has more than one hyperparameter.
 
         References
         ----------
@@ -128,11 +134,15 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         """
         if not posterior.hyperparameters:
             mean = estimate.params
-            if np.any(
-                (mean <= posterior.support[0]) | (mean >= posterior.support[1])
-            ):  # the paraboloid's top is outside
+            low, high = posterior.support
+            if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
                 mean = mean + estimate.covariance @ posterior.gradient(mean)
             return cls(mean, estimate.covariance, support=posterior.support)
+        if len(posterior.hyperparameters) > 1:
+            raise InputError(
+                f"posterior: got the hyperparameters {', '.join(posterior.hyperparameters)}, "
+                "expected at most one: proposals are nested on a single one"
+            )
         j = posterior.parameter_names.index(posterior.hyperparameters[0])
         rest = np.arange(estimate.params.size) != j
         ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
@@ -175,7 +185,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         return x
 
     def _interval(self, i: int, means: Floats, lowers: Floats, z: Floats) -> Floats:
-        """Where the i-th of the parameters near a bound keeps z_i, given those before it: both ends, shape (2, n)."""
+        """The interval of z_i that keeps the i-th of the parameters near a bound in the support.
+
+        It depends on the z before it; both ends, shape (2, n).
+        """
         given = means[..., i] + np.einsum("...j,...j->...", lowers[..., i, :i], z[:, :i])
         return np.asarray((self.bounds[i][:, None] - given) / lowers[..., i, i])
 
@@ -201,7 +214,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     def get_proposal(
         self, s: Floats, c: Sequence[Floats], random: np.random.RandomState
     ) -> tuple[Floats, Floats]:
-        """New positions for the walkers at s, and log q(s) - log q(new); the other walkers c are not used."""
+        """New positions for the walkers at s, and log q(s) - log q(new).
+
+        The other walkers c are not used.
+        """
         new = self.draw(len(s), random)
         before, after = np.split(self.log_density(np.concatenate([s, new])), 2)
         return new, before - after

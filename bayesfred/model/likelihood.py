@@ -1,0 +1,338 @@
+"""The likelihood of one frame, with its derivatives, as functions of a parameter vector.
+
+Here the table of parameters meets the compiled loops of `kernels`: a parameter vector becomes their
+arguments, and what they differentiate by becomes parameters again, through one linear map. Each
+thread evaluates in a workspace of its own, which is kept for the next call.
+"""
+
+import queue
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from scipy.special import gammaln
+
+from bayesfred._typing import Flags, Floats
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
+from bayesfred.imaging.kernels.jacobian import Basis
+from bayesfred.imaging.kernels.render import image
+from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
+from bayesfred.model.kernels.fisher import fisher
+from bayesfred.model.kernels.fluxes import Drawn, draw, log_likelihoods
+from bayesfred.model.kernels.gradient import gradient
+from bayesfred.model.kernels.likelihood import (
+    LIMIT,
+    MASKED,
+    Counts,
+    Workspace,
+    clear,
+    new_workspace,
+)
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.parameters import (
+    BACKGROUND_POWERS,
+    BACKGROUND_TERMS,
+    SOURCE_NUISANCES,
+    Nuisances,
+    Parameter,
+)
+from bayesfred.model.threads import share
+
+Arguments = tuple[Floats, Floats, Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameLikelihood:
+    """Likelihood of a frame of counts given distortion, background and nuisances.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    counts : ndarray, shape (ny, nx), counts; finite
+    noise : PoissonNoise or BackgroundNoise
+    mask : ndarray of bool, shape (ny, nx)
+        Pixels in the likelihood.
+    nuisances : Nuisances
+    parameters : tuple of Parameter
+        The table, in the order of every parameter vector.
+    narrowest : float, optional, pixel
+        Width of the narrowest PSF for which pixels have to be integrated well.
+    extrapolation : FluxExtrapolation, optional
+        Where free fluxes have their maximum, near some parameters; see `near`.
+    """
+
+    model: ForwardModel
+    counts: Floats
+    noise: PoissonNoise | BackgroundNoise
+    mask: Flags
+    nuisances: Nuisances
+    parameters: tuple[Parameter, ...]
+    narrowest: float | None = None
+    extrapolation: FluxExtrapolation | None = None
+
+    def log_likelihood(self, vectors: Floats, wanted: Flags) -> Floats:
+        """Log-likelihood of parameter vectors, in as many threads as numba may use.
+
+        Parameters
+        ----------
+        vectors : ndarray, shape (n, d)
+        wanted : ndarray of bool, shape (n,)
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            -inf where it is not wanted, or where the distortion has no density.
+        """
+        out = np.where(wanted, 0.0, -np.inf)
+        arguments = self._arguments(vectors)
+        extrapolated = self.extrapolation and self.extrapolation.at(vectors)
+        turn = np.zeros(1, np.int64)
+
+        def evaluate() -> None:
+            with self._workspace() as w:
+                log_likelihoods(
+                    self._optics, self._frame, w, *arguments, self._flux, self._free,
+                    extrapolated, turn, out,
+                )  # fmt: skip
+
+        share(evaluate, len(vectors))
+        return out + self._constant
+
+    def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
+        """The same likelihood, evaluated several times faster around `params` if fluxes are free.
+
+        Parameters
+        ----------
+        params : ndarray, shape (d,)
+        covariance : ndarray, shape (d, d)
+            How far around.
+
+        Returns
+        -------
+        FrameLikelihood
+        """
+        if self.nuisances.profiled != 1:
+            return self
+        arguments = self._one(params)
+        unused = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
+        with self._rendered(arguments) as (w, drawn):
+            slope, z = gradient(
+                self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis,
+                *unused,
+            )  # fmt: skip
+        if not np.isfinite(slope):
+            return replace(self, extrapolation=None)
+        extrapolation = flux_extrapolation(
+            self.model, self.fluxes, drawn.fitted, z[:, 0], params, covariance
+        )
+        return replace(self, extrapolation=extrapolation)
+
+    def gradient(self, params: Floats) -> Floats:
+        """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
+        arguments = self._one(params)
+        sources, background = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
+        with self._rendered(arguments) as (w, drawn):
+            slope, _ = gradient(
+                self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis,
+                sources, background,
+            )  # fmt: skip
+        if np.isnan(slope):
+            return np.full(len(self.parameters), np.nan)
+        if isinstance(self.noise, BackgroundNoise):
+            level = arguments[2][0]
+            residual = self.counts - self.expected_counts(params)
+            squares = float(np.sum(residual[self.mask] ** 2))
+            background[0] += 0.5 * (squares / level - self._frame.pixels) / level
+        return np.asarray(np.concatenate([sources, [slope], background]) @ self._chain_rule(params))
+
+    def fisher(self, params: Floats) -> Floats:
+        """Fisher information, free fluxes profiled out, shape (d, d); NaN where there is none."""
+        arguments = self._one(params)
+        sources, terms = self._basis.row.size, len(self.nuisances.background_names)
+        known_part = np.zeros((sources + terms, sources + terms))
+        with self._rendered(arguments) as (w, drawn):
+            known = fisher(
+                self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free,
+                self._basis, known_part,
+            )  # fmt: skip
+        if np.isnan(known):
+            return np.full((len(self.parameters),) * 2, np.nan)
+        if isinstance(self.noise, BackgroundNoise):
+            known_part[sources, sources] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
+        # the scatter is independent of the others: it is known by the shifts' size alone
+        size = sources + 1 + len(BACKGROUND_TERMS)
+        out = np.zeros((size, size))
+        index = [*range(sources), *range(sources + 1, sources + 1 + terms)]
+        out[np.ix_(index, index)] = known_part
+        out[sources, sources] = known
+        change = self._chain_rule(params)
+        return np.asarray(change.T @ out @ change)
+
+    def expected_counts(self, params: Floats) -> Floats:
+        """Expected counts of every pixel, shape (ny, nx), fluxes at their most likely values."""
+        return self._expected(params)[0]
+
+    def fluxes(self, params: Floats) -> Floats:
+        """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
+        return self._expected(params)[1]
+
+    def simulate(self, params: Floats, rng: np.random.Generator) -> Floats | None:
+        """Draw a frame given the parameters, free fluxes and the sources' shifts from their priors.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx), counts
+            None where the likelihood is zero whatever the counts: a source is folded or has no
+            image, or expected counts are negative.
+        """
+        theta, nuisances, background = self._one(params)
+        scale, *offset, sigma, scatter = (float(value) for value in nuisances)
+        flux = scale * self._flux
+        if self._free:
+            flux = self._flux * rng.gamma(2.0, 0.5, self._flux.size)
+        ny, nx = self.model.detector.shape
+        optics, out = self._optics, np.zeros(ny * stride(nx))
+        unfolded = image(optics, theta, *offset, sigma, flux, out)
+        if scatter:
+            # a shift is as imaged: it moves the image, and leaves the distortion that of the
+            # catalogue's position
+            by_x, by_y = scatter * rng.standard_normal((2, flux.size))
+            out[:] = 0.0
+            moved = optics._replace(x=optics.x + by_x, y=optics.y + by_y)
+            image(moved, theta, *offset, sigma, flux, out)
+        sources = out.reshape(ny, -1)[:, :nx]
+        level = self._background(background) - self.noise.shift
+        if not (unfolded and np.all((sources + level)[self.mask] >= 0.0)):
+            return None
+        return self.noise.draw(sources, np.maximum(level, -sources), rng)
+
+    def _expected(self, params: Floats) -> tuple[Floats, Floats]:
+        arguments = self._one(params)
+        ny, nx = self.model.detector.shape
+        with self._rendered(arguments) as (w, drawn):
+            sources = w.image.reshape(ny, -1)[:, :nx].copy()
+        bad = 0.0 if drawn.extra > -np.inf else np.nan
+        expected = sources + self._background(arguments[2]) - self.noise.shift + bad
+        return expected, drawn.fitted.fluxes + bad
+
+    def _background(self, background: Floats) -> Floats:
+        """The background polynomial at every pixel."""
+        u, v = (np.arange(1 - n, n, 2) / n for n in self.model.detector.shape[::-1])
+        out = np.zeros(self.model.detector.shape)
+        for (m, n), value in zip(BACKGROUND_POWERS, background, strict=True):
+            if value:
+                out += value * u**m * v[:, None] ** n
+        return out
+
+    def _arguments(self, vectors: Floats) -> Arguments:
+        """Distortion coefficients, source nuisances and background coefficients, a row a vector."""
+        distortion = self.model.polynomial
+        source = np.tile(self._neutral, (len(vectors), 1))
+        background = np.zeros((len(vectors), len(BACKGROUND_TERMS)))
+        for k, parameter in enumerate(self.parameters):
+            if parameter.kind != "distortion":
+                values = source if parameter.kind == "source" else background
+                values[:, parameter.slot] = vectors[:, k]
+        background[:, 0] += self.noise.shift
+        theta = distortion.monomial_coefficients(vectors[:, : distortion.n_terms])
+        return np.ascontiguousarray(theta), source, background
+
+    def _one(self, params: Floats) -> Arguments:
+        """The arguments of one parameter vector."""
+        theta, source, background = self._arguments(params[None])
+        return theta[0], source[0], background[0]
+
+    @cached_property
+    def _neutral(self) -> Floats:
+        """The source nuisances where none is free."""
+        return np.array([row.neutral(self.model.psf.sigma) for row in SOURCE_NUISANCES])
+
+    def _chain_rule(self, params: Floats) -> Floats:
+        """Derivatives of what the kernels differentiate by with respect to the parameters.
+
+        Its rows are the distortion's monomials, the free nuisances of the sources, the scatter and
+        the background's terms. The kernels' derivative by flux is relative to the scaled flux.
+        """
+        d = self.model.polynomial
+        change = np.eye(d.n_terms) if d.basis is None else d.basis
+        monomials, sources = len(change), self._basis.row.size
+        free = [name for name in self.nuisances.source_names if name != "position_scatter"]
+        out = np.zeros((sources + 1 + len(BACKGROUND_TERMS), len(self.parameters)))
+        for k, parameter in enumerate(self.parameters):
+            if parameter.kind == "distortion":
+                out[:monomials, k] = change[:, parameter.slot]
+            elif parameter.kind == "background":
+                out[sources + 1 + parameter.slot, k] = 1.0
+            elif parameter.name == "position_scatter":
+                out[sources, k] = 1.0
+            else:
+                scale = 1.0 / params[k] if parameter.name == "flux_scale" else 1.0
+                out[monomials + free.index(parameter.name), k] = scale
+        return out
+
+    @contextmanager
+    def _workspace(self) -> Iterator[Workspace]:
+        """A workspace that no other thread uses meanwhile."""
+        try:
+            workspace = self._workspaces.get_nowait()
+        except queue.Empty:
+            start = np.array([parameter.start for parameter in self.parameters])
+            workspace = new_workspace(self._optics, self._one(start)[1], self._free)
+        yield workspace
+        self._workspaces.put(workspace)
+
+    @contextmanager
+    def _rendered(self, arguments: Arguments) -> Iterator[tuple[Workspace, Drawn]]:
+        """A workspace in which the sources are rendered, for one set of arguments."""
+        with self._workspace() as w:
+            yield w, draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
+            clear(w)
+
+    @cached_property
+    def _workspaces(self) -> "queue.SimpleQueue[Workspace]":
+        return queue.SimpleQueue()
+
+    @cached_property
+    def _optics(self) -> Optics:
+        return self.model.optics(self.narrowest)
+
+    @cached_property
+    def _basis(self) -> Basis:
+        free = [name for name in self.nuisances.source_names if name != "position_scatter"]
+        return self.model.basis(free)
+
+    @property
+    def _flux(self) -> Floats:
+        return self.model.sources.flux
+
+    @property
+    def _free(self) -> Literal[True] | None:
+        return True if self.nuisances.flux == "free" else None  # code for None is not compiled
+
+    @cached_property
+    def _frame(self) -> Counts:
+        ny, nx = self.model.detector.shape
+        values = np.full((ny, stride(nx)), MASKED)
+        values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, MASKED)
+        used = (values > LIMIT).reshape(-1, SEGMENT)
+        clean = np.where(used, values.reshape(-1, SEGMENT), 0.0)
+        total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
+        return Counts(
+            values.ravel(), used.sum(axis=1).astype(float), total, squares, float(used.sum()),
+            float(total.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
+        )  # fmt: skip
+
+    @cached_property
+    def _constant(self) -> float:
+        """The part of the log-likelihood that depends on the counts alone."""
+        if isinstance(self.noise, BackgroundNoise):
+            return 0.0
+        shifted = np.maximum(self.counts[self.mask] + self.noise.shift, 0.0)
+        return -float(np.sum(gammaln(shifted + 1.0)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}

@@ -1,0 +1,87 @@
+"""Which pixels of a frame enter the likelihood, once the frame has been found to be explicable."""
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred._typing import Flags, Floats
+from bayesfred.errors import InputError
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.parameters import Nuisances
+
+
+def usable_pixels(
+    model: ForwardModel,
+    counts: Floats,
+    mask: npt.ArrayLike | None,
+    noise: PoissonNoise | BackgroundNoise,
+    nuisances: Nuisances,
+) -> Flags:
+    """The pixels for the likelihood, after checking that the frame can be explained at all.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    counts : ndarray, shape (ny, nx), counts
+    mask : array_like of bool, shape (ny, nx), optional
+    noise : PoissonNoise or BackgroundNoise
+    nuisances : Nuisances
+
+    Returns
+    -------
+    ndarray of bool, shape (ny, nx)
+
+    Raises
+    ------
+    InputError
+        If it cannot.
+    """
+    if isinstance(noise, BackgroundNoise) and (
+        nuisances.flux == "free" or nuisances.background_order
+    ):
+        raise InputError(
+            "noise: got BackgroundNoise with free fluxes or a varying background, expected fixed "
+            "or scaled fluxes and background_order 0: use PoissonNoise"
+        )
+    shape = model.detector.shape
+    used = np.ones(shape, bool) if mask is None else np.array(mask, dtype=bool)
+    for name, array in (("counts", counts), ("mask", used)):
+        if array.shape != shape:
+            raise InputError(f"{name}: got shape {array.shape}, expected the detector's {shape}")
+    ny, nx = model.detector.fine_shape
+    sources = model.sources
+    if not np.any((np.abs(sources.x) <= 0.5 * nx) & (np.abs(sources.y) <= 0.5 * ny)):
+        raise InputError(
+            f"catalogue: got {len(sources)} sources, all outside the frame of {nx} x {ny} pixels, "
+            "expected positions in pixels from the frame's middle: check the columns, their unit "
+            "and their origin"
+        )
+    if nuisances.footprint is not None:
+        used &= _footprint(model, nuisances.footprint)
+    if not used.any():
+        raise InputError(
+            "counts: every pixel is masked, expected pixels to fit: check the mask and the "
+            "footprint"
+        )
+    n_bad = int(np.sum(used & ~np.isfinite(counts)))
+    if n_bad:
+        raise InputError(
+            f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them"
+        )
+    if isinstance(noise, PoissonNoise) and noise.read_noise == 0 and counts[used].min() < 0:
+        raise InputError(
+            f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: check "
+            "gain and pedestal, give read_noise, or mask these pixels"
+        )
+    return used
+
+
+def _footprint(model: ForwardModel, radius: float) -> Flags:
+    """Pixels within `radius` of a source's catalogue position."""
+    u, v = model.detector.pixel_centres()
+    inside = np.zeros((v.size, u.size), bool)
+    for x, y in zip(model.sources.x, model.sources.y, strict=True):
+        across, along = np.abs(u - x) <= radius, np.abs(v - y) <= radius
+        near = (u[across] - x) ** 2 + (v[along, None] - y) ** 2 <= radius**2
+        inside[np.ix_(along, across)] |= near
+    return inside

@@ -1,0 +1,1 @@
+"""The maximum: matching, Newton steps, rejection of outliers, fit statistics."""

@@ -1,0 +1,1 @@
+"""The draws: moves, ensembles, stopping, convergence, the chain and its file."""
