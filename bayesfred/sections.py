@@ -20,6 +20,9 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origi
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
+# imported to be registered: the families that the package brings
+import bayesfred.imaging.psf  # noqa: F401
+import bayesfred.model.noise  # noqa: F401
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.io.serialize import kinds

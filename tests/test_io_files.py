@@ -16,8 +16,10 @@ from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
 from bayesfred.errors import InputError
+from bayesfred.io.atomic import replace
 from bayesfred.io.catalogues import CatalogueRecord, read_catalogue, write_catalogue
 from bayesfred.io.frames import read_frame, write_frame
+from bayesfred.io.paths import may_write
 
 COUNTS = np.arange(35.0).reshape(5, 7)
 FRAME_SUFFIXES = [".fits", ".fit", ".FTS", ".fits.gz", ".fits.fz", ".h5", ".hdf5", ".npy"]
@@ -414,6 +416,69 @@ def test_folders_that_cannot_be_written(tmp_path: Path) -> None:
     for folder in ("none", "file"):
         text = message(write_frame, tmp_path / folder / "frame.npy", COUNTS)
         assert "frame.npy: cannot be written (" in text
+
+
+@pytest.mark.parametrize("sole_writer", [False, True])
+def test_a_file_is_replaced_in_one_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sole_writer: bool
+) -> None:
+    done: list[str] = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, n=name, f=real: (done.append(n), f(*a))[1])
+    path = tmp_path / "page.html"
+    path.write_text("old")
+    replace(path, b"ne", memoryview(b"w"), sole_writer=sole_writer)
+    assert path.read_text() == "new"
+    assert done == ["fsync", "replace", "fsync"]  # the file before, the folder after
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    left, other = tmp_path / ".page.html.tmp", tmp_path / ".page.html.0a1b2c3d.tmp"
+    (tmp_path / "precious").write_text("precious")
+    left.symlink_to("precious")
+    other.write_text("of another writer, who is busy with it")
+    replace(tmp_path / "page.html", b"new", sole_writer=True)
+    assert not left.is_symlink() and other.exists()
+    assert (tmp_path / "precious").read_text() == "precious"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(1)])
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(type(error)):
+        replace(tmp_path / "page.html", b"new")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "zero\0byte", "file/below"])
+def test_names_that_cannot_be_written(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    assert "cannot be written (" in message(replace, tmp_path / name, b"new")
+
+
+def test_one_answer_to_a_file_that_exists(tmp_path: Path) -> None:
+    run, page = tmp_path / "run.h5", tmp_path / "run.html"
+    for resume in (None, False, True):
+        assert may_write(run, overwrite=False, resume=resume, beside=[page]) is False
+    page.touch()  # of another run: there is none to resume
+    text = message(may_write, run, overwrite=False, resume=True, beside=[page])
+    assert text.startswith(f"{page}: exists, expected a new file: write elsewhere, or replace it")
+    assert may_write(run, overwrite=True, resume=False, beside=[page]) is False
+    run.symlink_to("nowhere")  # a link that leads nowhere is something that exists, too
+    assert may_write(run, overwrite=False, resume=True, beside=[page]) is True
+    text = message(may_write, run, overwrite=False, resume=False, beside=[page])
+    assert text.startswith(f"{run}: exists, expected a new file: resume it with --resume, or repl")
+    assert "--resume" not in message(may_write, run, overwrite=False)
+    assert "got both --resume and --overwrite" in message(
+        may_write, run, overwrite=True, resume=True
+    )
 
 
 # Catalogues

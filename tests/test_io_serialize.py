@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Protocol
 
 import h5py
@@ -174,6 +174,19 @@ def test_kinds_of_a_section() -> None:
         kinds("psf")["gaussian"] is bf.GaussianPSF and kinds("noise")["poisson"] is bf.PoissonNoise
     )
     assert list(kinds("test")) == sorted(kinds("test")) and kinds("no_such") == {}
+
+
+@serializable("test.cached")
+@dataclass(frozen=True)
+class Cached:
+    side: float
+    area: float | None = field(default=None, metadata={"stored": False})
+
+
+def test_a_field_may_be_left_out(group: h5py.Group) -> None:
+    write(group, Cached(2.0, 4.0))
+    assert set(group.attrs) == {"kind", "side"}
+    assert read(group, Cached) == Cached(2.0)
 
 
 # --- what files cannot hold -----------------------------------------------------------------------

@@ -4,7 +4,7 @@ A task is told a number. What it works on, the study, is sent to a worker when t
 it does not have it: once a worker, whatever the executor and whenever the worker joins. Task k's
 random numbers are those of `SeedSequence(seed).spawn`'s child k, so that answers do not depend on
 who works or in which order. Every finished task is a row of a table on disk before the next is
-waited for; a study that is stopped goes on behind its last whole row.
+waited for; a study that is stopped resumes behind its last whole row.
 """
 
 import hashlib
@@ -324,7 +324,7 @@ def _progress(total: int, completed: int, show: bool) -> Iterator[Callable[[bool
 def _check_same(
     path: Path, record: tables.TableRecord, study: Study, contents: Mapping[str, str]
 ) -> None:
-    """Refuse to go on with another study."""
+    """Refuse to resume another study."""
     stored = record.meta.get("contents")
     if not isinstance(stored, dict) or list(record.columns) != ["task", *study.columns, "message"]:
         raise InputError(

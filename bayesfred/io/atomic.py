@@ -36,8 +36,8 @@ def writing(path: Path) -> Iterator[None]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(
-            f"{path}: cannot be written ({reason}), expected room on the disk and a folder and a "
-            "file that can be written"
+            f"{path}: cannot be written ({reason}), expected a disk with room and a folder that "
+            "can be written"
         ) from error
 
 

@@ -33,7 +33,7 @@ def may_write(
     resume : bool, optional
         Whether a run that is there may be resumed; None where the file holds no run.
     beside : sequence of path-like
-        Files that are made anew with it, such as the page of a run.
+        Files that are rebuilt with it, such as the page of a run.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def resolve(path: PathLike, run_file: PathLike, *, must_exist: bool = False) -> 
     run_file : path-like
         The run file.
     must_exist : bool
-        Raise where nothing is found, and say where it was sought.
+        Raise where nothing is found, and say where it was looked for.
 
     Returns
     -------

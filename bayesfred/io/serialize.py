@@ -12,7 +12,8 @@ mapping of str to any of these             a group of kind `mapping`, with its `
 frozen distribution of `scipy.stats`       a group of kind `distribution`: `family`, `parameters`
 =========================================  =====================================================
 
-Nothing is pickled, and reading makes objects of registered classes only, through their
+A field declared with `field(metadata={"stored": False})` is not stored: its constructor supplies
+it. Nothing is pickled, and reading makes objects of registered classes only, through their
 constructors, which check what they are given.
 """
 
@@ -177,7 +178,8 @@ def read(group: Any, expected: type[T]) -> T:
 
 
 def _stored(cls: type) -> list[str]:
-    return [field.name for field in fields(cls) if field.init]
+    """The names of the fields that files hold."""
+    return [f.name for f in fields(cls) if f.init and f.metadata.get("stored", True)]
 
 
 def _text(value: str) -> np.bytes_:
