@@ -100,8 +100,8 @@ def unit_text(parameter: Any) -> str:
 
     Examples
     --------
-    >>> from bayesfred.model.parameters import Parameter
-    >>> unit_text(Parameter("f_ux2", "f", (("u", 1), ("x", 2)), "", -2))
+    >>> from types import SimpleNamespace
+    >>> unit_text(SimpleNamespace(unit="", pixels=-2))
     'px^-2'
     """
     power = parameter.pixels
