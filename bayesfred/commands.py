@@ -379,10 +379,7 @@ def show_comparison(compared: comparison.Comparison) -> bool:
         "as well as the best"
     )
     if not compared.reliable:
-        print(
-            "not reliable: a few draws decide the weights of some pixels (Pareto k): look for bad "
-            "pixels"
-        )
+        print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
     return compared.reliable
 
 

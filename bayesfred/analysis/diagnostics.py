@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import arviz_base
+import lazy_loader
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -32,6 +33,9 @@ from bayesfred.sampling.chainfile import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
+
+# takes long to load, and most of what imports this module judges no chain
+arviz_stats = lazy_loader.load("arviz_stats")
 
 MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
@@ -232,9 +236,6 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
 
     `log_part` is the factor's logarithm at the draws, shape (n,).
     """
-    # takes long to load, and most of what imports this module judges no chain
-    from arviz_stats import psense
-
     if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
         return np.full(len(names), np.nan)
     if np.ptp(log_part) < FLAT:
@@ -248,7 +249,7 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
     ):
         warnings.filterwarnings("ignore", message="Number of tail draws")
         try:
-            sensitivity = psense(data)
+            sensitivity = arviz_stats.psense(data)
         except ValueError:  # hardly a draw differs from another
             return np.full(len(names), np.nan)
     return np.array([float(sensitivity[name]) for name in names])
