@@ -1,4 +1,4 @@
-"""What a finished run is worth: is it sampled well, does it fit the counts, what is the prior's part.
+"""What a finished run is worth: how it is sampled, whether it fits the counts, what the prior does.
 
 `diagnose` puts all into one record. Sampling is judged on R-hat, effective sample sizes,
 acceptance and the optimiser's own verdict (`bayesfred.sampling.convergence` holds the estimators).
