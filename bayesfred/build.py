@@ -46,7 +46,7 @@ def catalogue(
     at_edge = kept & (beyond > -3.0 * psf.sigma).any(axis=0)
     numbers = (
         f"{len(record.x)} sources, {at_edge.sum()} at the frame's edge, {(~kept).sum()} "
-        "outside left out"
+        "outside removed"
     )
     return SourceCatalog(
         record.x[kept], record.y[kept], record.flux[kept]

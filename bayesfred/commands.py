@@ -260,16 +260,14 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
     InputError
         If the chain is missing, damaged, or named as its page or picture would be.
     """
-    chain = open_chain(chain_file)
-    assert chain.path is not None, "in a file"
-    if chain.path in pipeline.beside(chain.path):
+    path = Path(chain_file)
+    chain = open_chain(path)
+    if path in pipeline.beside(path):
         raise InputError(
-            f"{chain_file}: got a chain named as its report, which would replace it, expected "
+            f"{path}: got a chain named as its report, which would replace it, expected "
             "NAME.h5: rename it"
         )
-    return pipeline.write_results(
-        chain, Path(chain_file).stem, target_ess=target_ess or chain.target_ess
-    )
+    return pipeline.write_results(chain, path, target_ess=target_ess or chain.target_ess)
 
 
 def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:
@@ -340,8 +338,7 @@ def show_run(result: Result) -> bool:
             f"prior-dominated: {', '.join(diagnostics.prior_dominated)}: the frame does not "
             "decide alone, see the report"
         )
-    assert chain.path is not None, "in a file"
-    _print_files(chain=chain.path, report=result.page, picture=result.picture)
+    _print_files(chain=result.path, report=result.page, picture=result.picture)
     print(diagnostics.message)
     return diagnostics.trustworthy
 
@@ -381,10 +378,7 @@ def show_comparison(compared: comparison.Comparison) -> bool:
         "as well as the best"
     )
     if not compared.reliable:
-        print(
-            "not reliable: a few draws decide the weights of some pixels (Pareto k): look for bad "
-            "pixels"
-        )
+        print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
     return compared.reliable
 
 

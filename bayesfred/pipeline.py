@@ -59,13 +59,14 @@ class Result:
     diagnostics : Diagnostics
     summary : astropy.table.Table
         The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
-    page, picture : Path
-        The files beside the chain.
+    path, page, picture : Path
+        The files: the chain, its report and its picture.
     """
 
     chain: Chain
     diagnostics: Diagnostics
     summary: Table
+    path: Path
     page: Path
     picture: Path
 
@@ -276,17 +277,17 @@ def fit_frame(
         ) from error
     if say:
         say(f"maximum: {chain.estimate.message}")
-    return write_results(chain, job.run_file.stem, job, target_ess=s.target_ess)
+    return write_results(chain, output, job, target_ess=s.target_ess)
 
 
-def write_results(chain: Chain, title: str, job: Job | None = None, *, target_ess: float) -> Result:
+def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_ess: float) -> Result:
     """Judge a chain, and write page and picture beside it.
 
     Parameters
     ----------
     chain : Chain
-    title : str
-        Heading of the page.
+    path : Path
+        The chain's file.
     job : Job, optional
         The run that made the chain, if it is known.
     target_ess : float
@@ -305,11 +306,10 @@ def write_results(chain: Chain, title: str, job: Job | None = None, *, target_es
     diagnostics = diagnose(chain, target_ess=target_ess)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
-    assert chain.path is not None, "in a file"
-    page, picture = beside(chain.path)
+    page, picture = beside(path)
     write_report(
         page,
-        title=printable(title),
+        title=printable((job.run_file if job else path).stem),
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
@@ -318,7 +318,7 @@ def write_results(chain: Chain, title: str, job: Job | None = None, *, target_es
         settings=job.run.model_dump_json(indent=2) if job else None,
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
-    return Result(chain, diagnostics, table, page, picture)
+    return Result(chain, diagnostics, table, path, page, picture)
 
 
 def beside(chain: Path) -> tuple[Path, Path]:

@@ -35,7 +35,10 @@ array_stats: Any = import_module("arviz_stats.base").array_stats
 
 
 def ar1(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Floats:
-    """Stationary AR(1) processes of unit variance along the last axis; their tau is (1 + phi) / (1 - phi)."""
+    """Stationary AR(1) processes of unit variance along the last axis.
+
+    Their tau is (1 + phi) / (1 - phi).
+    """
     x = rng.standard_normal(shape)
     for t in range(1, shape[-1]):
         x[..., t] = phi * x[..., t - 1] + np.sqrt(1.0 - phi**2) * x[..., t]
@@ -196,7 +199,7 @@ def profile() -> Floats:
 
 
 def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None = None) -> Any:
-    """Stand-in with the attributes that `diagnose` reads: a spot of free flux on a constant background."""
+    """Stand-in for what `diagnose` reads: a source of free flux on a constant background."""
     spot = profile()
     return SimpleNamespace(
         counts=counts,
@@ -349,7 +352,7 @@ def test_a_varying_background_has_no_paper_statistic() -> None:
 
 
 def weighed(prior: Any, likelihood: Any, steps: int = 300) -> Any:
-    """`diagnose` of draws from a posterior that is normal in both parameters, the second of which the prior leaves alone.
+    """`diagnose` of draws from a posterior that is normal in both parameters.
 
     Prior and likelihood are normal distributions of the first parameter; the second's likelihood is
     standard normal.
@@ -366,7 +369,7 @@ def weighed(prior: Any, likelihood: Any, steps: int = 300) -> Any:
 
 
 def distance(p: Any, q: Any) -> float:
-    """Cumulative Jensen-Shannon distance of two normal distributions, by quadrature over the range of 38,400 draws.
+    """Cumulative Jensen-Shannon distance of two normals over the range of 38,400 draws.
 
     The integrals' scale is the integral of the distribution functions, which grows with the range.
     """
@@ -380,7 +383,7 @@ def distance(p: Any, q: Any) -> float:
 
 
 def sensitivity(scaled: Any, fixed: Any) -> float:
-    """That of a normal posterior to the power of one of its two normal factors, from the definition."""
+    """Sensitivity of a normal posterior to the power of one of its two normal factors."""
 
     def posterior(alpha: float) -> Any:
         a, b = alpha / scaled.var(), 1.0 / fixed.var()

@@ -201,7 +201,7 @@ def check_verdict(folder: Path, output: Output, *, trustworthy: bool) -> None:
 
 
 def test_a_psf_that_is_too_wide_is_not_trusted(folder: Path) -> None:
-    """Sampled as well as the right one, but 20 % wide: the counts say so, and so does the verdict."""
+    """20 % too wide, it is sampled as well as the right one; the counts and the verdict say so."""
     sections(psf="sigma = 3.0")(folder)
     output = invoke(folder, "fit", "run.toml")
     check_verdict(folder, output, trustworthy=False)
@@ -220,14 +220,13 @@ def test_python_callers_hear_nothing_unless_they_ask(
     with contextlib.chdir(folder):
         result = bayesfred.commands.fit("run.toml")
         bayesfred.commands.simulate_frame("run.toml", overwrite=True)
-        again = bayesfred.commands.report("run.h5")
         bayesfred.commands.verify("run.h5")
         assert capfd.readouterr() == ("", "")
         bayesfred.commands.fit("run.toml", overwrite=True, say=heard.append)
     assert capfd.readouterr().out == ""
     assert [line.split(":")[0] for line in heard] == ["frame.fits", "stars.csv", "maximum"]
     assert result.summary["name"].tolist() == list(NAMES)
-    assert not again.diagnostics.sampled_well and not again.diagnostics.trustworthy
+    assert not result.diagnostics.sampled_well and not result.diagnostics.trustworthy
 
 
 def test_fit_recovers_the_truth(finished: tuple[Path, Output]) -> None:
@@ -297,8 +296,8 @@ def test_report_that_asks_for_more_than_there_is_exits_with_3(
     output = invoke(tmp_path, "report", "run.h5", "--target-ess", "1000000")
     assert output.code == 3
     assert re.search(
-        r"^not trustworthy: The model fits .* Not sampled well: effective sample size \d+ of \w+ is "
-        r"below 1000000\.$",
+        r"^not trustworthy: The model fits .* Not sampled well: effective sample size \d+ of \w+ "
+        r"is below 1000000\.$",
         output.stdout,
         re.M,
     )
@@ -917,7 +916,7 @@ def test_saturated_and_lost_pixels_are_counted_on_screen_and_page(folder: Path) 
 
 
 def test_outliers_are_rejected_if_asked_for(folder: Path) -> None:
-    """The catalogue lacks a star of the frame, and has one of 5,000 photons that the frame lacks."""
+    """The catalogue lacks a star of the frame, and has one of 5,000 photons that is not there."""
     lines = (folder / "stars.csv").read_text().splitlines()
     (folder / "stars.csv").write_text("\n".join([*lines[:3], *lines[4:], "24,8,5000", ""]))
     output = invoke(folder, "fit", "run.toml")
@@ -956,7 +955,7 @@ def test_sources_at_the_edge_are_kept_and_others_removed(folder: Path) -> None:
 
 
 def test_a_source_removed_as_outside_changes_no_pixel(simulated: Path) -> None:
-    """A source just beyond gives no light, even if a distortion of three prior sd brings it nearer."""
+    """A source just beyond gives no light, even if a distortion of 3 prior sd brings it nearer."""
     run = read_settings(simulated / "run.toml")
     model = open_model(run, x=37.5 * (1 + build.STRAY) + 2.5 * (-2 * np.log(1e-8)) ** 0.5)
     prior = 0.1 / 37.5  # of f_ux: a tenth of the half-width at the corner
@@ -1087,7 +1086,7 @@ EVIL = """<img src=x onerror="alert(1)">'&amp;{{ 7 * 7 }}"""
 
 
 def test_names_are_escaped_on_the_page(folder: Path) -> None:
-    """The run file's name is the title, frame and catalogue are in the notes, columns in settings."""
+    """The title is the run file's name; frame and catalogue are in notes, columns in settings."""
     (folder / "frame.fits").rename(folder / f"{EVIL}.fits")
     (folder / "stars.csv").write_text(
         (folder / "stars.csv").read_text().replace("flux", "<script>")
@@ -1115,16 +1114,16 @@ CONTROL = "\x1b[31m[bold red]\r\nnight\x07\udcff"
 
 def test_control_characters_and_markup_are_escaped(folder: Path) -> None:
     """In names of files and FITS extensions, on the screen and on the page."""
-    spelt = r"\x1b[31m[bold red]\r\nnight\x07\udcff"
-    assert spelt in invoke(folder, "fit", f"{CONTROL}.toml").stderr
+    escaped = r"\x1b[31m[bold red]\r\nnight\x07\udcff"
+    assert escaped in invoke(folder, "fit", f"{CONTROL}.toml").stderr
     os.replace(folder / "run.toml", folder / f"{CONTROL}.toml")
     text = run_text(sampling=FEW_STEPS).replace('[output]\npath = "run.h5"', "[output]")
     (folder / f"{CONTROL}.toml").write_text(text)
     output = invoke(folder, "fit", f"{CONTROL}.toml")
     assert output.code == 3
     assert all(c.isprintable() for line in output.stdout.splitlines() for c in line)
-    assert f"chains/{spelt}.h5" in output.stdout
-    assert f"<title>{spelt}</title>" in (folder / "chains" / f"{CONTROL}.html").read_text(
+    assert f"chains/{escaped}.h5" in output.stdout
+    assert f"<title>{escaped}</title>" in (folder / "chains" / f"{CONTROL}.html").read_text(
         encoding="utf-8"
     )
 
@@ -1240,7 +1239,7 @@ def test_ctrl_c_in_a_likelihood_says_one_line(
 
     def stop(posterior: Posterior, params: NDArray[np.float64]) -> object:
         nonlocal calls
-        calls += len(params) > 1  # the search for the maximum asks for one at a time
+        calls += params.ndim == 2 and len(params) > 1  # the search asks for one at a time
         if calls == 18:
             raise KeyboardInterrupt
         return log_prob(posterior, params)
@@ -1380,7 +1379,7 @@ def test_real_frame(tmp_path: Path) -> None:
 
 
 def dipoles(posterior: Posterior, params: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Residuals at every star projected on the model's slopes along v and u, in standard deviations."""
+    """Residuals at every star projected on the model's slopes along v and u, in units of sigma."""
     expected, sigma = posterior.expected_counts(params), posterior.sigma(params)
     residual = (posterior.counts - expected) / sigma
     sources, (ny, nx) = posterior.model.sources, expected.shape

@@ -1,4 +1,4 @@
-"""The paper's numbers made anew: the quick part of `examples/paper` against its committed README, and against what must come out.
+"""The paper's numbers: the quick part of `examples/paper` against its README, and known answers.
 
 Where a number has an error, tolerances are in units of it: the row's own posterior standard
 deviation.
@@ -54,7 +54,7 @@ def committed(text: str) -> dict[str, tuple[str, str]]:
 
 
 def close(one: str, other: str) -> bool:
-    """Whether two cells say the same: within a tenth of the error that they state, or a hundredth where they state none.
+    """Whether two cells agree: to a tenth of the error stated, or a hundredth where none is.
 
     An error itself may differ by 15 %, those of the Laplace approximation from those of a thousand
     draws. "about" is the size of a rounding error, which is up to the machine.
@@ -95,7 +95,7 @@ def test_readme_says_what_comes_out(name: str) -> None:
 
 
 def test_readme_that_says_something_else_is_noticed() -> None:
-    """Negative control: a coefficient half a standard deviation off, another verdict, a row that is not there."""
+    """Negative control: a coefficient half an sd off, another verdict, a row that is not there."""
     line = next(
         line for line in README.splitlines() if line.startswith("| λ = 10, paper's noise: f_vx,")
     )
@@ -110,7 +110,7 @@ def test_readme_that_says_something_else_is_noticed() -> None:
 
 
 def test_readme_lists_every_printed_number() -> None:
-    """All rows of Table 2, and those of Table 3: 12 coefficients in one cell without noise, each by itself with it."""
+    """All rows of Table 2, and of Table 3: 12 coefficients in a cell without noise, 24 with it."""
     known = committed(README)
     assert sum("paper's noise: " in key and ", 1e-6" in key for key in known) == 36
     assert (
@@ -143,7 +143,7 @@ def test_printed_errors_tell_how_columns_are_read() -> None:
 
 
 def test_columns_are_those_of_figure_2_and_of_the_pinhole() -> None:
-    """Read as here, the printed truth is the function of Fig. 2b and the pinhole sees what the paper's saw."""
+    """The printed truth is the function of Fig. 2b, and the pinhole sees what the paper's saw."""
     powers = dict(zip(common.DISTORTION.names, common.truth("table2"), strict=True))
     printed = common.PRINTED["figure2"]["polynomial"]
     assert {
@@ -172,7 +172,7 @@ def test_correction_of_the_sampling_effect() -> None:
 
 
 def test_noise_that_correction_correlates() -> None:
-    """Errors quoted by a fit to the corrected frame are too small, the more the narrower the spots."""
+    """Errors quoted by a fit to the corrected frame are too small, more so for narrow spots."""
     quoted = room("sampling").quoted_over_true
     assert quoted(0.8) < 0.95 < 0.98 < quoted(3.0) < 1.0
 
@@ -194,7 +194,7 @@ def test_reconstruction_without_noise_leaves_rounding() -> None:
 
 @pytest.mark.parametrize("kind", ["paper's noise", "Poisson counts"])
 def test_coefficients_lie_within_their_errors(kind: str) -> None:
-    """36 of each kind: none is 4 standard deviations off, and their mean square is 1 within 4 of its own."""
+    """36 of each kind: none is 4 sd off, and their mean square is 1 within 4 of its own sd."""
     table = rows("table2")
     z = deviations(
         table, kind, dict(zip(common.DISTORTION.names, common.truth("table2") / 1e-6, strict=True))

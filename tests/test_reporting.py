@@ -22,13 +22,14 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model.parameters import Nuisances, Parameter
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
 from bayesfred.reporting.html import page_figures, write_report
 from bayesfred.reporting.labels import axis_label
 from bayesfred.reporting.posteriors import corner_plot, overview, trace_plot
 from bayesfred.reporting.screen import parameter_table
-from bayesfred.sampling.summary import summary
+from bayesfred.sampling.summary import summary, unit_text
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ BACKGROUND = 5.0
 
 
 def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
-    """A chain of independent draws around the truth, and its posterior, as far as the report reads."""
+    """Independent draws around the truth and their posterior, as far as the report reads them."""
     rng = np.random.default_rng(1)
     distortion = PolynomialDistortion(((1, 0, 1, 0), (2, 0, 1, 0)), ((0, 1, 0, 1), (0, 2, 0, 1)))
     model = ForwardModel(
@@ -62,7 +63,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         expected_counts=lambda params: model.expected_counts(params[:4], params[4]),
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
     )
-    posterior.parameters = parameters(posterior)
+    posterior.parameters = described(*names)
     estimate = SimpleNamespace(
         params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9
     )
@@ -80,6 +81,19 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "posterior": lambda: posterior,
     }
     return SimpleNamespace(**fields), posterior
+
+
+def described(*names: str) -> tuple[Any, ...]:
+    """Stand-ins with the fields of a `Parameter` that are shown."""
+    shown = {
+        "background": {"unit": "counts"},
+        "f_ux": {"letter": "f", "powers": (("u", 1), ("x", 1)), "pixels": -1},
+        "f_ux2": {"letter": "f", "powers": (("u", 1), ("x", 2)), "pixels": -2},
+        "g_vy": {"letter": "g", "powers": (("v", 1), ("y", 1)), "pixels": -1},
+        "g_vy2": {"letter": "g", "powers": (("v", 1), ("y", 2)), "pixels": -2},
+    }
+    plain = {"letter": "", "powers": (), "unit": "", "pixels": 0}
+    return tuple(SimpleNamespace(name=name, **(plain | shown.get(name, {}))) for name in names)
 
 
 def pixels(figure: Figure) -> Floats:
@@ -282,22 +296,30 @@ def test_summary_of_a_chain_computes_what_diagnose_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "label"),
+    ("name", "label", "unit"),
     [
-        ("f_ux2", r"$f_{u x^2}$ [$10^{-6}$ px$^{-2}$]"),
-        ("g_vy", r"$g_{v y}$ [$10^{-6}$ px$^{-1}$]"),
-        ("background", r"background [$10^{-6}$ counts]"),
-        ("background_uv", r"$b_{u v}$ [$10^{-6}$ counts]"),
-        ("psf_sigma", r"psf sigma [$10^{-6}$ px]"),
-        ("flux_scale", r"flux scale [$10^{-6}$]"),
+        ("f_ux2", r"$f_{u x^2}$ [$10^{-6}$ px$^{-2}$]", "px^-2"),
+        ("g_vy", r"$g_{v y}$ [$10^{-6}$ px$^{-1}$]", "px^-1"),
+        ("background", r"background [$10^{-6}$ counts]", "counts"),
+        ("background_uv", r"$b_{u v}$ [$10^{-6}$ counts]", "counts"),
+        ("psf_sigma", r"psf sigma [$10^{-6}$ px]", "px"),
+        ("flux_scale", r"flux scale [$10^{-6}$]", ""),
     ],
 )
-def test_labels_carry_power_and_unit(name: str, label: str) -> None:
-    assert axis_label(described(name)[0], -6) == label
+def test_labels_carry_power_and_unit(name: str, label: str, unit: str) -> None:
+    by_name = {parameter.name: parameter for parameter in everything().parameters}
+    assert axis_label(by_name[name], -6) == label
+    assert unit_text(by_name[name]) == unit
 
 
-def described(*names: str) -> tuple[Parameter, ...]:
-    return parameters(SimpleNamespace(parameter_names=names))
+def everything() -> Posterior:
+    """The posterior of a frame with parameters of every kind."""
+    distortion = PolynomialDistortion(((2, 0, 1, 0),), ((0, 1, 0, 1),))
+    model = ForwardModel(
+        Detector((9, 9)), SourceCatalog.grid(1, 1.0, 50.0), GaussianPSF(1.0), distortion
+    )
+    nuisances = Nuisances("scale", offset=True, psf_sigma=True, background_order=2)
+    return Posterior(model, np.ones((9, 9)), nuisances=nuisances)
 
 
 # --- figures --------------------------------------------------------------------------------------
@@ -332,13 +354,14 @@ def test_trace_has_a_panel_for_every_parameter(d: int) -> None:
     rng = np.random.default_rng(3)
     chain: Any = SimpleNamespace(
         chain=rng.normal(size=(3, 6, 8, d)),
-        parameter_names=tuple(f"f_u{k + 1}x" for k in range(d)),
+        parameter_names=("f_ux", "f_ux2", "g_vy", "g_vy2", *(f"name {k}" for k in range(9)))[:d],
         burn_in=1,
     )
     figure = trace_plot(chain, described(*chain.parameter_names))
     shown = [ax for ax in figure.axes if ax.get_visible()]
     assert len(shown) == 2 * d
-    assert sum("f_{" in ax.get_ylabel() for ax in shown) == d
+    labels = [ax.get_ylabel() for ax in shown[::2]]
+    assert labels[0].startswith("$f_{u x}$") and len(set(labels)) == d
     pixels(figure)
 
 

@@ -1,4 +1,4 @@
-"""What a finished run is worth: is it sampled well, does it fit the counts, what is the prior's part.
+"""What a finished run is worth: how it is sampled, whether it fits the counts, what the prior does.
 
 `diagnose` puts all into one record. Sampling is judged on R-hat, effective sample sizes,
 acceptance and the optimiser's own verdict (`bayesfred.sampling.convergence` holds the estimators).
@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import arviz_base
+import lazy_loader
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -32,6 +33,9 @@ from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
+
+# takes long to load, and most of what imports this module judges no chain
+arviz_stats = lazy_loader.load("arviz_stats")
 
 MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
@@ -266,9 +270,6 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
 
     `log_part` is the factor's logarithm at the draws, shape (n,).
     """
-    # takes long to load, and most of what imports this module judges no chain
-    from arviz_stats import psense
-
     if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
         return np.full(len(names), np.nan)
     if np.ptp(log_part) < FLAT:
@@ -282,7 +283,7 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
     ):
         warnings.filterwarnings("ignore", message="Number of tail draws")
         try:
-            sensitivity = psense(data)
+            sensitivity = arviz_stats.psense(data)
         except ValueError:  # hardly a draw differs from another
             return np.full(len(names), np.nan)
     return np.array([float(sensitivity[name]) for name in names])

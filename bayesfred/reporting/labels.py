@@ -110,7 +110,8 @@ def math_symbol(parameter: Parameter) -> str:
 
     Examples
     --------
-    >>> math_symbol(Parameter("f_ux2", "f", (("u", 1), ("x", 2)), "", -2))
+    >>> from types import SimpleNamespace
+    >>> math_symbol(SimpleNamespace(letter="f", powers=(("u", 1), ("x", 2))))
     '$f_{u x^2}$'
     """
     if not parameter.letter:
@@ -138,7 +139,8 @@ def axis_label(parameter: Parameter, exponent: int, separator: str = " ") -> str
 
     Examples
     --------
-    >>> axis_label(Parameter("psf_sigma", pixels=1), -2)
+    >>> from types import SimpleNamespace
+    >>> axis_label(SimpleNamespace(name="psf_sigma", letter="", unit="", pixels=1), -2)
     'psf sigma [$10^{-2}$ px]'
     """
     pixels = parameter.pixels
@@ -161,7 +163,8 @@ def html_symbol(parameter: Parameter) -> Markup:
 
     Examples
     --------
-    >>> print(html_symbol(Parameter("f_ux2", "f", (("u", 1), ("x", 2)), "", -2)))
+    >>> from types import SimpleNamespace
+    >>> print(html_symbol(SimpleNamespace(letter="f", powers=(("u", 1), ("x", 2)))))
     <i>f</i><sub>ux<sup>2</sup></sub>
     """
     if not parameter.letter:
@@ -185,7 +188,8 @@ def html_unit(parameter: Parameter, exponent: int) -> Markup:
 
     Examples
     --------
-    >>> print(html_unit(Parameter("f_ux2", "f", (("u", 1), ("x", 2)), "", -2), -6))
+    >>> from types import SimpleNamespace
+    >>> print(html_unit(SimpleNamespace(unit="", pixels=-2), -6))
     10<sup>−6</sup> px<sup>−2</sup>
     """
     parts = [_raised("10", exponent)] if exponent else []

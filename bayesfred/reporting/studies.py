@@ -20,7 +20,7 @@ from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.study_helpers import LEVELS
 from bayesfred.model.parameters import Parameter
-from bayesfred.reporting.labels import math_symbol
+from bayesfred.reporting.labels import axis_label, math_symbol
 from bayesfred.reporting.style import ENSEMBLE_COLOURS, POSTERIOR_COLOUR, TRUTH_COLOUR
 
 __all__ = ["calibration_plot", "noise_plot"]
@@ -42,7 +42,7 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
     study : NoiseStudy
         Its first variable of several values is the abscissa; combinations of the others are series.
     parameters : sequence of Parameter
-        Those of the study's model, for their symbols.
+        Those of the study's model, for their symbols and units.
 
     Returns
     -------
@@ -81,12 +81,12 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
     for ax in (*widths[: len(names)], *shares):
         ax.set_xscale("log" if every.max() > 3.0 * every.min() else "linear")
         ax.tick_params(labelsize=8)
-    symbols = {parameter.name: math_symbol(parameter) for parameter in parameters}
+    labels = {parameter.name: axis_label(parameter, 0) for parameter in parameters}
     for k, ax in enumerate(widths):
         ax.set_visible(k < len(names))
         if k < len(names):
             ax.set_yscale("log")
-            ax.set_title(f"sd of {symbols[names[k]]}", fontsize=9.5)
+            ax.set_title(f"sd of {labels[names[k]]}", fontsize=9.5)
             ax.tick_params(which="both", labelbottom=k + columns >= len(names), labelsize=8)
         if k < len(names) <= k + columns:
             ax.set_xlabel(VARIABLE_LABELS[abscissa], fontsize=8.5)

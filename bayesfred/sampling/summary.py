@@ -4,12 +4,13 @@ The terminal, the page and `Chain.summary` show this table: `bayesfred.reporting
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.io.summary_table import Table, make_table
+from bayesfred.model.parameters import Parameter
 from bayesfred.sampling.convergence import convergence
 
 if TYPE_CHECKING:
@@ -85,13 +86,12 @@ def summary(
     )
 
 
-def unit_text(parameter: Any) -> str:
+def unit_text(parameter: Parameter) -> str:
     """Write a parameter's unit in plain characters.
 
     Parameters
     ----------
     parameter : Parameter
-        See `bayesfred.model.parameters`.
 
     Returns
     -------
@@ -100,8 +100,8 @@ def unit_text(parameter: Any) -> str:
 
     Examples
     --------
-    >>> from bayesfred.model.parameters import Parameter
-    >>> unit_text(Parameter("f_ux2", "f", (("u", 1), ("x", 2)), "", -2))
+    >>> from types import SimpleNamespace
+    >>> unit_text(SimpleNamespace(unit="", pixels=-2))
     'px^-2'
     """
     power = parameter.pixels

@@ -1,4 +1,6 @@
-"""Make the reference posteriors beside this file: `python chains/reference/make.py [paper] [faint] [free]`.
+"""Make the reference posteriors beside this file.
+
+    python chains/reference/make.py [paper] [faint] [free]
 
 Each is the run of a run file, long enough that every parameter has 10,000 effective draws, kept as
 means, standard deviations and quantiles with their Monte Carlo errors, and 500 of the draws.
@@ -29,7 +31,7 @@ DRAWS = 500
 
 
 def posterior(name: str, **model: Any) -> bf.Posterior:
-    """The posterior of a run file's simulated frame; with other settings of the fit's model, if given."""
+    """The posterior of a run file's simulated frame, with other settings of [model], if given."""
     path = FOLDER / f"{name}.toml"
     run = settings.read_settings(path)
     assert run.simulation is not None
@@ -53,7 +55,7 @@ def error(values: Floats) -> Floats:
 
 
 def summary(chain: bf.Chain) -> dict[str, dict[str, Any]]:
-    """Mean, standard deviation and quantiles of every parameter, each with its Monte Carlo error."""
+    """Mean, standard deviation and quantiles of every parameter with their Monte Carlo errors."""
     kept = chain.chain[:, chain.burn_in :]
     draws = chain.draws()
     mean, sd = draws.mean(axis=0), draws.std(axis=0)

@@ -1,1 +1,1 @@
-"""The paper's tables and figures made anew: `python -m examples.paper` makes all, `python -m examples.paper table2` one."""
+"""The paper's tables and figures: `python -m examples.paper` makes all, `... table2` one."""

@@ -1,9 +1,9 @@
-"""Make the paper's tables and figures anew.
+"""Make the paper's tables and figures.
 
     python -m examples.paper                   everything: README.md and pictures/ beside this file
-    python -m examples.paper table2 figure6    print these and make their pictures python -m
-    examples.paper --quick           print what takes no sampling, in half a minute (the tests
-    compare it with README.md)
+    python -m examples.paper table2 figure6    print these and make their pictures
+    python -m examples.paper --quick           print what takes no sampling, in half a minute
+                                               (the tests compare it with README.md)
 
 Everything takes five to ten minutes on two cores. Seeds are fixed, so that a run again gives the
 same numbers up to rounding.
@@ -18,11 +18,12 @@ MODULES = ("frames", "sampling", "figure5", "figure6", "table2", "table3")
 
 HEAD = """# The paper's tables and figures
 
-Made by `python -m examples.paper`; do not edit. The paper is Y. Sun & J. Zhou, *Field Distortion Model Based on Fredholm Integral*.
-Every number that it prints stands beside ours; a number with ± is a posterior mode and its standard deviation, or its section
-says what the error is. Two numbers agree if they differ by less than three standard errors of their difference, both
-measurements having the same error (the frames have different noise); without noise, as each row or section says. "about" is
-rounding error, of which the size alone means something.
+Made by `python -m examples.paper`; do not edit. The paper is Y. Sun & J. Zhou, *Field Distortion
+Model Based on Fredholm Integral*. Every number that it prints stands beside ours; a number with ±
+is a posterior mode and its standard deviation, or its section says what the error is. Two numbers
+agree if they differ by less than three standard errors of their difference, both measurements
+having the same error (the frames have different noise); without noise, as each row or section says.
+"about" is rounding error, of which the size alone means something.
 """
 
 
@@ -59,7 +60,7 @@ def summary(sections: list[Section]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m examples.paper", description="The paper's tables and figures made anew."
+        prog="python -m examples.paper", description="The paper's tables and figures."
     )
     parser.add_argument(
         "names", nargs="*", choices=[*MODULES, []], help="which of " + ", ".join(MODULES)

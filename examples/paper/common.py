@@ -1,4 +1,4 @@
-"""What the tables and figures share: the printed numbers, the paper's field, rows that compare, pictures."""
+"""What the tables and figures share: printed numbers, the paper's field, rows, pictures."""
 
 import io
 import math
@@ -53,7 +53,7 @@ DISTORTION = read_as(COLUMNS)
 
 
 def paper_model(distortion: Any = DISTORTION, psf_sigma: float | None = None) -> bf.ForwardModel:
-    """The 505 x 505 frame of Fig. 1, with the kernel as the paper prints it: a distorted source loses or gains flux."""
+    """The 505 x 505 frame of Fig. 1, with the kernel as printed, which does not conserve flux."""
     o = PRINTED["object"]
     sources = bf.SourceCatalog.grid(o["sources"], o["spacing"], o["flux"])
     psf = bf.GaussianPSF(psf_sigma or o["psf_sigma"])
@@ -194,7 +194,7 @@ def small(value: float) -> str:
 
 
 def same(paper: float, ours: float, sd: float, rounding: float = 0.0) -> bool:
-    """Whether two measurements of the same kind, each with this standard deviation, agree within three of them."""
+    """Whether two measurements, each with this standard deviation, agree within three of them."""
     return bool(abs(paper - ours) <= 3.0 * math.sqrt(2.0) * sd + rounding)
 
 

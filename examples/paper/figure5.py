@@ -1,4 +1,4 @@
-"""Fig. 5: the reference PSF, cut out around the central spot of Fig. 2b and interpolated (Whittaker-Shannon), against the true one.
+"""Fig. 5: the PSF cut out around Fig. 2b's central spot and interpolated, against the true one.
 
 The paper's spots overlap: halfway to its neighbours, 25 pixels away, the central one has fallen to
 4 % of its peak, and so have they. The same measurement on a source that stands alone shows what
@@ -19,7 +19,7 @@ HALF_WIDTHS = {"Fig. 2b": 25, "alone": 80}
 
 
 def measured(frame: Floats, half_width: int) -> tuple[bf.SampledPSF, Floats, Floats]:
-    """The PSF measured at the axis, the offsets of its samples from the middle, and its error in units of the true peak."""
+    """The PSF measured at the axis, offsets of its samples, and its error over the true peak."""
     psf = bf.SampledPSF.measured(frame, (0.0, 0.0), half_width, oversampling=OVERSAMPLING)
     model = paper_model()
     offsets = (np.arange(len(psf.values)) - len(psf.values) // 2) / OVERSAMPLING

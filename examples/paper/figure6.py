@@ -1,4 +1,4 @@
-"""Fig. 6: the polynomial and the logarithmic frame reconstructed, their residuals, V; and how many terms the logarithm needs.
+"""Fig. 6: both frames reconstructed, their residuals, V, and how many terms the logarithm needs.
 
 V is the sum over pixels of squared residuals in units of a source's flux, for frames without noise
 as in the paper. What is left of the logarithm with the paper's 12 terms has structure. More terms

@@ -1,6 +1,6 @@
-"""Fig. 1 to 3 and Table 1: the object, the shift-invariant, polynomial and logarithmic frames, and eight single terms.
+"""Fig. 1 to 3 and Table 1: the object, three frames of it, and eight single terms.
 
-Images without noise, drawn with the kernel as the paper prints it. The paper prints no number
+Images without noise, rendered with the kernel as the paper prints it. The paper prints no number
 beside these figures; what can be checked is how far the sources move, and what the kernel without
 Jacobian determinant makes of their flux.
 """

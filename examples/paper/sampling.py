@@ -1,4 +1,4 @@
-"""Fig. 4: what a sensor's pixels make of a spot, its correction by R^-1 I R^-1, and what that does to the errors of a fit.
+"""Fig. 4: a spot as pixels record it, its correction by R^-1 I R^-1, and the errors of a fit.
 
 The spot has sigma = 3 pixels, in a frame of 101 x 101 at whose border it has vanished. What the
 paper does not show: noise that was white becomes correlated. For coverage the spots are narrow
@@ -40,7 +40,7 @@ TRIALS = 250
 
 
 def spot(pixel: str) -> Floats:
-    """The paper's spot in the frame's middle, peak 1: its values at the pixels' centres, or its exact integrals over them."""
+    """The paper's spot, peak 1: its values at the pixels' centres, or its integrals over them."""
     sigma = PRINTED["figure4"]["psf_sigma"]
     u = np.arange(SIDE) - SIDE // 2
     if pixel == "impulse":
@@ -63,7 +63,7 @@ def four_spots(sigma: float, pixel: str) -> bf.ForwardModel:
 
 
 def quoted_over_true(sigma: float) -> float:
-    """Error that a fit to a corrected frame quotes, over the one it has: the mean over the coefficients, by linear propagation.
+    """Error that a fit to a corrected frame quotes over the one it has, by linear propagation.
 
     The fit takes pixels of the corrected frame for independent, each of variance mu (the corrected
     mean); they have the covariance R^-1 diag(recorded mean) R^-1 instead.
@@ -84,7 +84,7 @@ def quoted_over_true(sigma: float) -> float:
 
 
 def errors_in_units(trials: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Errors of the coefficients over those quoted, shape (trials, 4), and the deviance per pixel: of both ways."""
+    """Errors over those quoted, shape (trials, 4), and the deviance per pixel, of both ways."""
     background, theta = SPOTS[3], np.zeros(4)
     box, impulse = four_spots(NARROW, "box"), four_spots(NARROW, "impulse")
     z: dict[str, list[Floats]] = {"frame": [], "model": []}
@@ -110,7 +110,7 @@ def errors_in_units(trials: int) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def coverage_rows(trials: int) -> list[Row]:
-    """Share of the 90 % intervals that hold the truth, with the Monte Carlo error, for both ways."""
+    """Share of the 90 % intervals that hold the truth, with its Monte Carlo error, both ways."""
     frame, chi2_frame, model, chi2_model = errors_in_units(trials)
     rows = []
     level = stats.norm.ppf(0.95)
@@ -198,7 +198,7 @@ def make(quick: bool, folder: Path) -> Section:
 
 
 def noise_growth(n: int) -> float:
-    """Standard deviation of a middle pixel of R^-1 N R^-1 for white noise N of standard deviation 1."""
+    """Standard deviation of a middle pixel of R^-1 N R^-1 for white noise N of unit variance."""
     inverse = linalg.inv(bf.sampling_matrix(n))
     return float(np.sum(inverse[n // 2] ** 2))
 

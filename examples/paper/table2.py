@@ -53,7 +53,7 @@ READINGS = {
 
 
 def chi_square_of_printed_errors(columns: tuple[str, ...], g_in: str) -> list[float]:
-    """Chi-square, 12 degrees of freedom, of the printed errors at each background, for one reading of the columns."""
+    """Chi-square (12 degrees of freedom) of the printed errors at each background."""
     theta = truth("table2")
     bound = background_bound(paper_model(read_as(columns, g_in)), theta, 1.0)
     rounded = np.eye(theta.size) * ROUNDING**2 / 12.0

@@ -1,4 +1,4 @@
-"""Fig. 8, 9 and Table 3: 3175 x 3175 pixels binned to 127 x 127, the Fredholm model against the pinhole camera.
+"""Fig. 8, 9 and Table 3: 3175 x 3175 pixels binned to 127 x 127; Fredholm against pinhole.
 
 What the paper leaves open, and what is chosen here:
 
@@ -15,7 +15,7 @@ pixel. Then the pinhole's V rises
 - The logarithm: the printed coefficients are not those of x log(1 + c (u^2 + v^2)), whatever c,
 because x u^2 and x v^2 differ by a
   factor two, and 1e-5 is impossible: corner sources would be mirrored. f = x log(1 + 1e-8 (2 u^2 +
-  v^2)) and g = y log(1 + 1e-8 (3 u^2 + 2 v^2)) give them, and the printed V. It is drawn by its
+  v^2)) and g = y log(1 + 1e-8 (3 u^2 + 2 v^2)) give them, and the printed V. It is rendered by its
   series up to the tenth power, which is exact to 1e-9 pixel.
 - 9 x 9 sources, 300 fine pixels apart: with so many the logarithm's V is the printed one. Where
 sources stand moves a fit without
@@ -91,7 +91,10 @@ def model(
 
 
 def logarithm() -> tuple[bf.PolynomialDistortion, Floats]:
-    """f = x log(1 + p u^2 + q v^2) and g likewise as series: sum over n of (-1)^(n+1) / n (p u^2 + q v^2)^n."""
+    """f = x log(1 + p u^2 + q v^2) and g likewise as series.
+
+    The sum over n of (-1)^(n+1) / n (p u^2 + q v^2)^n.
+    """
     terms, theta = [], []
     for p, q in LOGARITHM:
         powers = [(n, a) for n in range(1, SERIES + 1) for a in range(n + 1)]
@@ -105,7 +108,7 @@ def logarithm() -> tuple[bf.PolynomialDistortion, Floats]:
 
 @dataclass
 class Noiseless:
-    """What is fitted to one layout's frames without noise, by `least_squares`: parameters, residuals, V."""
+    """Fits to one layout's frames without noise, by `least_squares`: parameters, residuals, V."""
 
     polynomial: Floats
     logarithm: Floats
@@ -115,7 +118,10 @@ class Noiseless:
     pinhole_logarithm: tuple[Floats, Floats, float]
 
     def numbers(self) -> dict[str, Floats]:
-        """Those that the paper prints, in its units; `rise` is how much V of the pinhole grows on average when noise is added."""
+        """Those that the paper prints, in its units.
+
+        `rise` is how much V of the pinhole grows on average when noise is added.
+        """
         k, left, value = self.pinhole
         theta_l, _, value_l = self.fredholm_logarithm
         k_l, _, value_pl = self.pinhole_logarithm
@@ -146,7 +152,7 @@ def noiseless(side: int = SIDE, reach: float = REACH) -> Noiseless:
 
 
 def errors(ours: Noiseless) -> dict[str, Floats]:
-    """Root mean square over the other layouts of how far their numbers are from ours, with the printed digits' rounding."""
+    """Root mean square distance of the other layouts' numbers from ours, rounding included."""
     nominal = ours.numbers()
     others = [noiseless(*layout).numbers() for layout in LAYOUTS if layout != (SIDE, REACH)]
     step = dict.fromkeys(nominal, 0.01) | {"value": 1e-4}  # of the last printed digit
@@ -159,7 +165,10 @@ def errors(ours: Noiseless) -> dict[str, Floats]:
 
 
 def seen_by_pinhole(columns: tuple[str, ...]) -> Floats:
-    """The pinhole's theta for the printed polynomial, to first order: u = x, v = y; terms that it lacks are lost."""
+    """The pinhole's theta for the printed polynomial, to first order: u = x, v = y.
+
+    Terms that it lacks are lost.
+    """
     d = read_as(columns)
     theta = dict.fromkeys(PINHOLE.names, 0.0)
     for name, (i, j, m, n), value in zip(
@@ -321,7 +330,7 @@ def within(paper: Floats | float, ours: Floats | float, error: Floats | float) -
 
 
 def row(quantity: str, paper: float, ours: float, error: float, why: str) -> Row:
-    """A number with the error that the unknown layout gives it; the remark is for one that does not agree."""
+    """A number with the error of the unknown layout; the remark is for one that does not agree."""
     agrees = bool(within(paper, ours, error))
     return Row(quantity, f"{paper:.2f}", measured(ours, error), agrees, "" if agrees else why)
 
@@ -338,7 +347,10 @@ def pinhole_rows(kind: str, numbers: Floats, error: Floats) -> list[Row]:
 
 
 def logarithm_rows(numbers: dict[str, Floats], error: dict[str, Floats]) -> list[Row]:
-    """The Fredholm model's fit to the logarithm without noise: u x^2 and u^2 x are nearly one term, so their sum counts."""
+    """The Fredholm model's fit to the logarithm without noise.
+
+    u x^2 and u^2 x are nearly one term, so their sum counts.
+    """
     value, spread, printed = (
         float(numbers["value"][0]),
         float(error["value"][0]),
@@ -360,7 +372,7 @@ def logarithm_rows(numbers: dict[str, Floats], error: dict[str, Floats]) -> list
 
 
 def noise_rows(fredholm: bf.ForwardModel, counts: Floats, params: Floats, sd: Floats) -> list[Row]:
-    """The row with noise: coefficients with their errors, chi-square, and how the printed errors compare with the bound."""
+    """The row with noise: coefficients, chi-square, and the printed errors against the bound."""
     paper, unit = np.array(T["noise"]["theta"]), T["unit"]
     rows = []
     for k, name in enumerate(DISTORTION.names):
