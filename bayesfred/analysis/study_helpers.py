@@ -1,8 +1,7 @@
-"""What studies do with one simulated frame: fit it as a user would, and count intervals that hold."""
-
-from typing import Literal, get_args
+"""What studies do with a simulated frame: fit it as users do, and count intervals that hold."""
 
 import math
+from typing import Literal, get_args
 
 import numpy as np
 
