@@ -780,7 +780,7 @@ CASES: dict[str, dict[str, Any]] = {
 @pytest.mark.statistics
 @pytest.mark.parametrize("case", CASES)
 def test_error_bars_hold(tmp_path: Path, case: str) -> None:
-    """Intervals and mean pulls of every parameter, within three standard errors, and the verdict."""
+    """Intervals and mean pulls of every parameter within three standard errors, and the verdict."""
     result = bf.calibrate_posterior(
         small(**CASES[case]), replicates=N, path=tmp_path / "s.ecsv", seed=1, progress=False
     )

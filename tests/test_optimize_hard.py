@@ -88,7 +88,8 @@ def run(posterior: Posterior, estimate: MapEstimate | None, path: Path, **option
 def apart(a: Floats, b: Floats) -> float:
     """Largest difference of means and of spreads between two runs, in Monte Carlo errors.
 
-    The draws have the shape (ensembles, steps, walkers, d). The error of a standard deviation s from n effective draws is s sqrt((kurtosis - 1) / 4 n).
+    The draws have the shape (ensembles, steps, walkers, d). The error of a standard deviation s
+    from n effective draws is s sqrt((kurtosis - 1) / 4 n).
     """
     means, spreads, errors = [], [], []
     for chain in (a, b):
