@@ -231,7 +231,7 @@ def test_without_adaptation_the_run_stalls(easy: Posterior, estimate: MapEstimat
     sampler = emcee.EnsembleSampler(32, 13, easy.log_prob, moves=moves, vectorize=True)
     random = np.random.RandomState(4).get_state()
     with threadpool_limits(1, user_api="blas"):
-        sampler.run_mcmc(emcee.State(adapting.chain[0, 0], random_state=random), 400)
+        sampler.run_mcmc(emcee.State(adapting.chain[0, 0], random_state=random), 1000)
     made = adapted(adapting.chain)
     assert longest_rest(sampler.get_chain()) > 300
     assert max(longest_rest(coords[made:]) for coords in adapting.chain) < 100
