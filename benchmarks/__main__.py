@@ -1,4 +1,4 @@
-"""How fast the package is: `python -m benchmarks` prints measure, ratio, bound and whether it is met.
+"""How fast the package is: `python -m benchmarks` prints measures, ratios and their bounds.
 
 Every row is a ratio within one run, of times the median of interleaved repetitions, so that it says
 something about the code and little about the machine. The problem is the paper's frame: 505 x 505
@@ -40,7 +40,10 @@ def ratio(
     repetitions: int,
     clock: Callable[[], float] = time.thread_time,
 ) -> float:
-    """Median time of `work` over that of `unit`, run in turn; the processor's time of this thread unless told otherwise."""
+    """Median time of `work` over that of `unit`, run in turn.
+
+    It is the processor's time of this thread, unless another clock is given.
+    """
     work(), unit()
     times = np.empty((repetitions, 2))
     for row in times:
@@ -99,7 +102,8 @@ def peak():  # of this program alone: getrusage's begins with that of the one wh
 
 def image(n, side):
     sources = bf.SourceCatalog.grid(side, 40.0, 1e5)
-    model = bf.ForwardModel(bf.Detector((n, n)), sources, bf.GaussianPSF(10.0), bf.PolynomialDistortion.mirrored())
+    distortion = bf.PolynomialDistortion.mirrored()
+    model = bf.ForwardModel(bf.Detector((n, n)), sources, bf.GaussianPSF(10.0), distortion)
     return model.expected_counts(np.zeros(12))
 
 image(101, 2)  # compiled code is loaded

@@ -1,4 +1,6 @@
-"""A large frame: 4096 x 4096 pixels, 10,000 sources of sigma 1.5, 30 parameters, two cores; `python -m benchmarks.large`.
+"""A large frame, on two cores: `python -m benchmarks.large`.
+
+It has 4096 x 4096 pixels, 10,000 sources of sigma 1.5, and 30 parameters.
 
 The parameters are the 28 coefficients of every term to degree 3 with f in x, y, u and g in x, y, v,
 the background and a common flux factor. Printed are the seconds to the maximum and to 1,000

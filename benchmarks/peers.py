@@ -1,4 +1,6 @@
-"""What others reach on the same posterior: the paper's frame, 13 parameters, Poisson counts; `python -m benchmarks.peers`.
+"""What other packages reach on the same posterior: `python -m benchmarks.peers`.
+
+It is that of the paper's frame, with 13 parameters and Poisson counts.
 
 Each peer is written as a careful user of that package would, in float64, vectorised and compiled,
 evaluating every source on a stamp of the pixels where it exceeds 1e-8 of its peak:
@@ -59,7 +61,10 @@ class Stamps:
         )
 
     def stamps(self, theta, exp):  # type: ignore[no-untyped-def]  # of NumPy or of JAX
-        """Expected counts of every source: the terms of `mirrored`, as polynomials in u and v for each source."""
+        """Expected counts of every source.
+
+        The terms of `mirrored` are polynomials in u and v for each source.
+        """
         x, y, u, v = self.x, self.y, self.u, self.v
         t = theta
         f = x * (u * (t[0] + t[2] * u + t[4] * x) + v * (t[1] + t[3] * v + t[5] * x))
@@ -139,7 +144,10 @@ def stretch(stamps: Stamps, estimate: bf.MapEstimate) -> float:
 
 
 def nuts(stamps: Stamps, estimate: bf.MapEstimate, start: np.ndarray) -> tuple[float, float]:
-    """Seconds to the maximum, by scipy's L-BFGS-B from no distortion, and effective draws a second, of NumPyro on JAX."""
+    """Seconds to the maximum, and effective draws a second, of NumPyro on JAX.
+
+    The maximum is found by scipy's L-BFGS-B from no distortion.
+    """
     import jax
     import jax.numpy as jnp
     import numpyro

@@ -1,4 +1,6 @@
-"""Whether the maximum is found without help: `python -m benchmarks.starts` fits random problems from counts alone.
+"""Whether the maximum is found from counts alone: `python -m benchmarks.starts`.
+
+It fits random problems.
 
 Every problem is drawn from its own number: a grid of 7 x 7 to 15 x 15 stars or 30 to 300 stars at
 random places, any of four sets of terms, a displacement at the field's corner of up to 1.5 times
@@ -82,19 +84,31 @@ def draw(number: int) -> tuple[bf.Posterior, np.ndarray, dict[str, Any]]:
     posterior = bf.Posterior(
         model, rng.poisson(mean), nuisances=bf.Nuisances(flux="free" if free else "fixed")
     )
+    light = float(np.median(flux))
     known = {
-        "number": number, "terms": terms, "field": "grid" if grid else "random", "stars": x.size, "sigma": sigma,
-        "spacing": spacing, "moved": moved, "background": background, "flux": float(np.median(flux)),
-        "fluxes": "free" if free else "fixed", "frame": shape[0],
-        "signal": float(np.median(flux) / math.sqrt(4 * math.pi * sigma**2 * background + np.median(flux))),
-    }  # fmt: skip
+        "number": number,
+        "terms": terms,
+        "field": "grid" if grid else "random",
+        "stars": x.size,
+        "sigma": sigma,
+        "spacing": spacing,
+        "moved": moved,
+        "background": background,
+        "flux": light,
+        "fluxes": "free" if free else "fixed",
+        "frame": shape[0],
+        "signal": light / math.sqrt(4 * math.pi * sigma**2 * background + light),
+    }
     return posterior, np.append(theta, background), known
 
 
 def coefficients(
     model: bf.ForwardModel, half: float, wanted: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, float]:
-    """Coefficients in a random ratio that move the field's corners by at most `wanted` pixels without a fold, and by how many."""
+    """Coefficients in a random ratio that move the field's corners without a fold.
+
+    They move them by at most `wanted` pixels; also returns by how many.
+    """
     d, s = model.distortion, model.sources
     fine = np.linspace(-half, half, 25)
     x, y = (axis.ravel() for axis in np.meshgrid(fine, fine))
@@ -131,7 +145,7 @@ def coefficients(
 
 
 def compile_all() -> None:
-    """Fit a small problem with fixed and with free fluxes, so that no other is charged with the compilation."""
+    """Compile: fit a small problem with fixed and with free fluxes before any is timed."""
     detector, sources = bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4)
     for distortion in TERMS.values():
         model = bf.ForwardModel(detector, sources, bf.GaussianPSF(3.0), distortion)
@@ -150,7 +164,10 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def scipys(posterior: bf.Posterior, method: str) -> np.ndarray:
-    """Where one of scipy's optimisers ends from no distortion, with the exact gradient, in the priors' standard deviations."""
+    """Where one of scipy's optimisers ends from no distortion, with the exact gradient.
+
+    It works in units of the priors' standard deviations.
+    """
     origin = posterior.start()
     scale = np.array([p.prior.std() for p in posterior.parameters])
 
@@ -171,14 +188,14 @@ def scipys(posterior: bf.Posterior, method: str) -> np.ndarray:
 
 
 def solve(task: tuple[int, bool]) -> dict[str, Any]:
-    """Fit a problem from counts alone, and from the truth, and by scipy's optimisers if asked to."""
+    """Fit a problem from counts alone, from the truth, and, if asked, by scipy's optimisers."""
     number, with_rivals = task
     posterior, truth, out = draw(number)
     (clipped, best), out["truth_seconds"] = timed(lambda: bf.reject_outliers(posterior, truth))
     (_, estimate), out["seconds"] = timed(lambda: bf.reject_outliers(posterior))
 
     def square(params: np.ndarray, reference: bf.MapEstimate) -> float:
-        """Mahalanobis distance over its 99.9 % quantile, squared; infinite if there is no maximum."""
+        """Squared Mahalanobis distance over its 99.9 % quantile; infinite without a maximum."""
         sd = np.sqrt(np.diag(reference.covariance))
         d, correlation = (params - reference.params) / sd, reference.covariance / np.outer(sd, sd)
         length = float(d @ linalg.solve(correlation, d, assume_a="pos")) / stats.chi2.ppf(
@@ -217,7 +234,7 @@ def order(value: str) -> tuple[float, str]:
 
 
 def table(rows: Iterable[dict[str, Any]]) -> Table:
-    """Share of problems in which the maximum is found, and the cost in units of a fit from the truth."""
+    """Share of problems whose maximum is found, and the cost in units of a fit from the truth."""
     rows = list(rows)
     tried = sum(METHODS[0] in row for row in rows)
     out = Table(title=f"{len(rows)} problems, {tried} of them also by scipy's optimisers")
@@ -231,9 +248,10 @@ def table(rows: Iterable[dict[str, Any]]) -> Table:
         for value in sorted({stratum(row) for row in rows}, key=order):
             part = [row for row in rows if stratum(row) == value]
             cells = [share([row["found"] for row in part])]
-            cells.append(
-                f"{sum(row['seconds'] for row in part) / sum(row['truth_seconds'] for row in part):.2f}"
+            alone, from_truth = (
+                sum(row[key] for row in part) for key in ("seconds", "truth_seconds")
             )
+            cells.append(f"{alone / from_truth:.2f}")
             cells += [
                 share([row[method]["found"] for row in part if method in row]) for method in METHODS
             ]
@@ -243,7 +261,10 @@ def table(rows: Iterable[dict[str, Any]]) -> Table:
 
 
 def logarithm() -> Table:
-    """The paper's Fig. 2c, without noise but for a background, fitted by least squares with its own kernel."""
+    """The paper's Fig. 2c, with a background but no noise, fitted by least squares.
+
+    The kernel is the paper's own.
+    """
     detector, sources, psf = (
         bf.Detector((505, 505)),
         bf.SourceCatalog.grid(9, 50.0, 1e5),

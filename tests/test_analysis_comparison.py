@@ -1,4 +1,4 @@
-"""Leave-one-out against brute force, against the frames that are truly left out, and on models that are known to be wrong.
+"""Leave-one-out against brute force, and on models that are known to be wrong.
 
 One source of 2,000 photons in 25 x 25 pixels; the chains are draws, not runs, so that each test
 costs a second or two.
@@ -39,7 +39,10 @@ def posterior(
 
 
 def drawn(target: bf.Posterior, n: int = 2000, seed: int = 1) -> Any:
-    """Draws of the posterior as a chain has them: the Laplace approximation, resampled by the posterior's own density."""
+    """Draws of the posterior as a chain has them.
+
+    They are of the Laplace approximation, resampled by the posterior's own density.
+    """
     estimate = bf.find_map(target)
     rng = np.random.default_rng(seed)
     proposal = stats.multivariate_t(estimate.params, estimate.covariance * 1.2, df=8, seed=rng)
@@ -59,7 +62,7 @@ def right() -> Any:
 
 
 def test_elpd_is_that_of_refits_without_the_pixel(right: Any) -> None:
-    """The pixel in which the source is steepest, and one far away, are left out and the model is fitted anew."""
+    """The pixel where the source is steepest, and one far away, are left out of another fit."""
     target = right.posterior()
     compared = compare({"a": right, "b": right}, draws=2000)
     every = pointwise(target, right)
@@ -75,7 +78,7 @@ def test_elpd_is_that_of_refits_without_the_pixel(right: Any) -> None:
 
 
 def pointwise(target: bf.Posterior, chain: Any) -> Floats:
-    """The harmonic mean of every pixel's density over the draws: leave-one-out without smoothing."""
+    """Leave-one-out without smoothing: the harmonic mean of a pixel's density over the draws."""
     mu = np.array([target.expected_counts(draw).ravel() for draw in chain.draws()])
     values = stats.poisson.logpmf(target.counts.ravel(), mu)
     assert np.ptp(values, axis=0).max() > SPREAD  # some pixels go the way of smoothing
@@ -83,7 +86,7 @@ def pointwise(target: bf.Posterior, chain: Any) -> Floats:
 
 
 def test_effective_parameters_are_counted(right: Any) -> None:
-    """A model that is right has as many as it has parameters, but for the scatter of the frame: here 2 within 1."""
+    """Of a right model it is the number of parameters, up to the scatter of the frame: 2 +- 1."""
     assert compare({"a": right, "b": right}).scores[0].p_loo == pytest.approx(2.0, abs=1.0)
 
 
@@ -100,14 +103,17 @@ def test_missing_term_is_missed_and_needless_one_is_not_chosen(right: Any) -> No
 
 
 def test_difference_is_less_uncertain_than_its_parts(right: Any) -> None:
-    """Pixels that both models predict alike cancel: the negative control adds the two models' errors instead."""
+    """Pixels that both models predict alike cancel.
+
+    The negative control adds the two models' errors instead.
+    """
     more = drawn(posterior(TERM, OTHER))
     last = compare({"more": more, "right": right}).scores[1]
     assert last.difference_se < 0.1 * np.hypot(last.elpd_se, last.elpd_se)
 
 
 def test_draw_that_is_decided_by_one_pixel_is_said_to_be_unreliable() -> None:
-    """A hot pixel on the flank of a bright source moves the whole fit: without it the posterior would be elsewhere."""
+    """A hot pixel on the flank of a bright source moves the whole posterior."""
     counts = bf.simulate(forward(TERM, flux=200.0), TRUTH[:1], TRUTH[1], seed=3)
     counts[12, 9] += 400.0
     target = bf.Posterior(forward(TERM, flux=200.0), counts)

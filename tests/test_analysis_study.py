@@ -1,4 +1,7 @@
-"""Studies on simulated frames: what they compute, that they resume and run in parallel bit for bit, that they catch errors."""
+"""Studies on simulated frames.
+
+What they compute, that they resume and run in parallel bit for bit, and that they catch errors.
+"""
 
 import multiprocessing
 import os
@@ -68,7 +71,10 @@ def leaves(values: Floats, probability: float) -> bool:
 
 @pytest.mark.parametrize("n", [10, 60, 150])
 def test_band_holds_uniform_numbers_as_often_as_it_says(n: int) -> None:
-    """2,000 sets: the Monte Carlo error of 5 % is 0.49 %. Counts are whole, so that a band may hold more than it says."""
+    """2,000 sets: the Monte Carlo error of 5 % is 0.49 %.
+
+    Counts are whole numbers, so that a band may hold more than it says.
+    """
     numbers = np.random.default_rng(1).random((2000, n))
     outside = np.mean([leaves(values, 0.95) for values in numbers])
     assert 0.05 - (0.05 if n == 10 else 4 * 0.0049) < outside < 0.05 + 4 * 0.0049
@@ -131,7 +137,10 @@ def test_simulated_background_and_noise() -> None:
 
 
 def test_simulated_fluxes_and_shifts_have_their_priors() -> None:
-    """One source: the total's mean is F and its variance F^2/2 + F, Gamma(2)'s and Poisson's; the centroid scatters by tau."""
+    """One source, whose centroid scatters by tau.
+
+    The total's mean is F and its variance F^2/2 + F, those of Gamma(2) and Poisson.
+    """
     sources = bf.SourceCatalog([2.0], [-1.0], [1e6])
     model = bf.ForwardModel(bf.Detector((41, 41)), sources, bf.GaussianPSF(2.0), tiny().distortion)
     nuisances = bf.Nuisances("free", position_scatter=True)
@@ -231,7 +240,10 @@ def test_cells_are_sums_over_frames(tmp_path: Path) -> None:
 
 
 def test_draws_agree_with_laplace(tmp_path: Path) -> None:
-    """On bright sources the posterior is nearly normal: means agree within the errors of 1,000 draws, widths within 10 %."""
+    """On bright sources the posterior is nearly normal.
+
+    Means agree within the errors of 1,000 draws, widths within 10 %.
+    """
     laplace, drawn = (
         levels(tmp_path / f"{m}.ecsv", method=m, replicates=2) for m in ("laplace", "mcmc")
     )
@@ -375,7 +387,7 @@ def test_the_processes_of_a_pool_end_with_a_study_that_is_killed(tmp_path: Path)
 
 
 class Forgetful:
-    """Workers that join late: the first three tasks meet one that lacks the study, whatever was sent before."""
+    """Workers that join late: each of the first three tasks meets one that lacks the study."""
 
     def __init__(self) -> None:
         self.misses = 3
@@ -448,7 +460,8 @@ from test_analysis_study import levels
 
 if __name__ == "__main__":
     path = Path(sys.argv[1])
-    workers = {"n_workers": 3, "threads_per_worker": 1, "dashboard_address": None, "host": "127.0.0.1"}
+    workers = {"n_workers": 3, "threads_per_worker": 1}
+    workers |= {"dashboard_address": None, "host": "127.0.0.1"}
     with LocalCluster(**workers) as cluster, Client(cluster) as client:
         pids = client.run(os.getpid)
 
@@ -563,7 +576,10 @@ def test_truth_is_ranked_among_the_draws(tmp_path: Path) -> None:
 
 
 def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> None:
-    """Where hardly a background photon is, the normal approximation reaches below zero; these draws are none."""
+    """With hardly any background the normal approximation extends below zero.
+
+    Draws there are left out.
+    """
     dark = bf.calibrate_posterior(
         small(background=0.001),
         replicates=3,
@@ -581,7 +597,10 @@ def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> No
 
 @pytest.mark.statistics
 def test_right_error_bars_are_found_right_and_wrong_ones_wrong(tmp_path: Path) -> None:
-    """The long run's verdict on few frames: of sources so bright that a determinant left out shows in every one."""
+    """The verdict of the long run on few frames.
+
+    Their sources are so bright that every frame shows a determinant that is missing.
+    """
     right, wrong = (
         bf.calibrate_posterior(
             small(flux=2e4), fitted=small(flux=2e4, conserve_flux=conserve), replicates=30,
@@ -663,8 +682,7 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool
 
     def run(text: str, **options: Any) -> bool:
         Path("run.toml").write_text(RUN + text, encoding="utf-8")
-        done = bf.commands.study("run.toml", **{"workers": 1, **options})
-        return bf.commands.show_study(done)
+        return bf.commands.show_study(bf.commands.study("run.toml", **{"workers": 1, **options}))
 
     return run
 
@@ -674,12 +692,8 @@ def test_run_file(study: Callable[..., bool], capsys: pytest.CaptureFixture[str]
     assert "8 frames, 0 failed" in capsys.readouterr().out
     table = tables.read_table("chains/run.noise.ecsv")
     assert (table.meta["study"], table.columns["task"].size) == ("noise", 8)
-    assert sorted(
-        set(tables.read_table("chains/run.noise.summary.ecsv").columns["background"])
-    ) == [
-        1.0,
-        10.0,
-    ]
+    summary = tables.read_table("chains/run.noise.summary.ecsv")
+    assert sorted(set(summary.columns["background"])) == [1.0, 10.0]
     assert Path("chains/run.noise.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(InputError, match=r"run.noise.ecsv: exists"):
         study("replicates = 4\nbackground = [1, 10]\n")
@@ -766,7 +780,7 @@ CASES: dict[str, dict[str, Any]] = {
 @pytest.mark.statistics
 @pytest.mark.parametrize("case", CASES)
 def test_error_bars_hold(tmp_path: Path, case: str) -> None:
-    """Of every parameter: 68 and 95 % intervals and the mean pull within three standard errors; of every quantity: the verdict."""
+    """Intervals and mean pulls of every parameter within three standard errors, and the verdict."""
     result = bf.calibrate_posterior(
         small(**CASES[case]), replicates=N, path=tmp_path / "s.ecsv", seed=1, progress=False
     )
@@ -806,7 +820,10 @@ def paper_levels(path: Path) -> bf.NoiseStudy:
 
 
 def attains_the_bound(cells: dict[str, NDArray[Any]]) -> bool:
-    """Efficiency over all levels from 0.9 to 1.1, five of its standard errors, and at each level within four of its own."""
+    """Efficiency over all levels from 0.9 to 1.1, which is five of its standard errors.
+
+    At each level it is 1 within four of its own.
+    """
     whole = cells["parameter"] == "theta"
     one, error = cells["efficiency"][whole], cells["efficiency_error"][whole]
     every = 1.0 / np.mean(1.0 / one)

@@ -1,4 +1,4 @@
-"""Verification: what was changed in a chain file, and sealed again, is found and named."""
+"""Verification: a change of a chain file that was sealed again is found and named."""
 
 import shutil
 from collections.abc import Callable
@@ -69,7 +69,7 @@ def finding(checks: list[Check], what: str) -> str:
 def test_a_run_holds(whole: Chain) -> None:
     checks = verify(whole.path)
     assert failed(checks) == set()
-    assert finding(checks, "first steps") == "10 made again from seed 1: equal bit for bit"
+    assert finding(checks, "first steps") == "10 replayed from seed 1: equal bit for bit"
     assert finding(checks, "log-probability") == "1000 of 1440 draws: differ by at most 0"
     moves = whole.accepted.sum()
     assert (
@@ -173,12 +173,10 @@ def test_a_maximum_that_was_not_found_is_not_asked_for(
     posterior: Posterior, estimate: MapEstimate, tmp_path: Path
 ) -> None:
     off = estimate.params + 0.3 * np.sqrt(np.diag(estimate.covariance))
-    given = replace(
-        estimate, params=off, log_prob=posterior.log_prob(off), converged=False, at_maximum=False
-    )
+    given = replace(estimate, params=off, log_prob=posterior.log_prob(off), at_maximum=False)
     checks = verify(run(posterior, given, tmp_path / "chain.h5", 3).path)
     assert all(check.holds for check in checks)
     assert finding(checks, "MAP") == "was stored as not at the maximum"
-    given = replace(given, converged=True, at_maximum=True)
+    given = replace(given, at_maximum=True)
     checks = verify(run(posterior, given, tmp_path / "other.h5", 3).path)
     assert failed(checks) >= {"MAP"}

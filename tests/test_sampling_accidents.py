@@ -473,6 +473,9 @@ def test_a_read_only_folder_is_refused_before_the_work(hopeless: Posterior, old:
 # --- others at the same file ----------------------------------------------------------------------
 
 
+SINCE = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\S+"
+
+
 def test_a_second_writer_hears_who_the_first_is_before_any_work(
     hopeless: Posterior, path: Path
 ) -> None:
@@ -480,8 +483,7 @@ def test_a_second_writer_hears_who_the_first_is_before_any_work(
     with only_writer(path):
         for options in ({"resume": True}, {"overwrite": True}, {}):
             with pytest.raises(
-                InputError,
-                match=rf"\(process {os.getpid()} on \S+ since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d\S+\)",
+                InputError, match=rf"\(process {os.getpid()} on \S+ since {SINCE}\)"
             ):
                 run(hopeless, None, path, TOTAL + 1, **options)
         (path.parent / ".chain.h5.writer").write_bytes(b"\x1b[31mme\n\xff" + b"x" * 10**6)

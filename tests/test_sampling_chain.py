@@ -266,7 +266,7 @@ def test_a_density_that_no_file_can_hold_is_refused_before_sampling(
     def never(log_prob: Any, params: ArrayLike) -> Floats:
         raise AssertionError("it was evaluated")
 
-    with pytest.raises(InputError, match="files cannot hold, .* or sample it in memory"):
+    with pytest.raises(InputError, match=r"files cannot hold, .* or sample it in memory"):
         sample(Watched(posterior, never), path=tmp_path / "chain.h5", seed=1, progress=False)
     assert list(tmp_path.iterdir()) == []
 

@@ -1,4 +1,4 @@
-"""Whether the sampler draws from the distribution that it is given: every move, the default mix, and the whole loop.
+"""Whether the sampler draws from the distribution given: each move, their mix, and the whole loop.
 
 Walkers start from exact draws of targets whose moments are known, so that a right kernel keeps the
 moments at every step and a wrong one drifts off. They run until the Monte Carlo error of every
@@ -59,7 +59,10 @@ def _one_blas_thread() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Target:
-    """A distribution, its exact first and second moments about zero, and a proposal that does not fit it well."""
+    """A distribution with its exact first and second moments about zero.
+
+    Mean and covariance are those of a proposal that does not fit it well.
+    """
 
     log_prob: Callable[[Floats], Floats]
     draw: Callable[[np.random.Generator, int], Floats]
@@ -199,7 +202,10 @@ SAMPLERS: dict[str, Callable[[Target, int], Steps]] = {
 
 
 def worst_moment(target: Target, steps: Steps, precision: float) -> float:
-    """Largest deviation of a first or second moment, in Monte Carlo errors that are all below the precision."""
+    """Largest deviation of a first or second moment, in Monte Carlo errors.
+
+    These are all below the precision.
+    """
     sums, exact = np.zeros((2, WALKERS, len(target.first))), np.array([target.first, target.second])
     due = 60
     for n, coords in enumerate(steps, start=1):
@@ -258,7 +264,9 @@ def test_the_snooker_move_is_noticed() -> None:
 @pytest.mark.parametrize("precision", PRECISION)
 @pytest.mark.parametrize("wrong", [False, True], ids=["right", "wrong"])
 def test_a_conjugate_posterior_is_sampled(tmp_path: Path, precision: float, wrong: bool) -> None:
-    """Poisson counts of a background alone under a gamma prior: its posterior is a gamma distribution, here of shape 6.
+    """Poisson counts of a background alone under a gamma prior.
+
+    The posterior is a gamma distribution, here of shape 6.
 
     The one source is too faint to matter, so that its distortion's posterior is the prior. The run
     is a whole one, which starts from the Laplace approximation. The negative control expects what
@@ -373,7 +381,7 @@ def features(params: Floats, counts: Floats) -> Floats:
 
 
 def joint_z(prior: dict[str, Any]) -> Floats:
-    """Deviations of the features' means between two ways of drawing parameters and counts, in Monte Carlo errors.
+    """Deviations of the features' means between two ways of drawing, in Monte Carlo errors.
 
     The prior is the sampler's.
 

@@ -1,4 +1,7 @@
-"""LaplaceMove's proposals against scipy's densities; `test_sampling_exactness.py` has what it samples."""
+"""LaplaceMove's proposals against scipy's densities.
+
+What it samples is tested in `test_sampling_exactness.py`.
+"""
 
 from dataclasses import dataclass
 
@@ -99,7 +102,7 @@ def test_draws_follow_the_density(d: int, k: int) -> None:
 
 
 def usable(move: LaplaceMove, posterior: Posterior) -> float:
-    """Share of the move's draws that are worth an independent one of the posterior, by importance weights."""
+    """Effective share of the move's draws as draws of the posterior, by importance weights."""
     draws = move.draw(2000, np.random.RandomState(4))
     log_weight = posterior.log_prob(draws) - move.log_density(draws)
     weight = np.exp(log_weight - log_weight.max())

@@ -1,4 +1,7 @@
-"""Fresh runs against the reference posteriors in `chains/reference/`, with the Monte Carlo errors of both."""
+"""Fresh runs against the reference posteriors in `chains/reference/`.
+
+Differences are judged by the Monte Carlo errors of both.
+"""
 
 import importlib.util
 import json

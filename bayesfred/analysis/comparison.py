@@ -1,4 +1,6 @@
-"""Which model predicts a frame best: leave-one-out predictive accuracy of every pixel, from the draws of each model's chain.
+"""Which model predicts a frame best, by leave-one-out predictive accuracy of every pixel.
+
+It is computed from the draws of each model's chain.
 
 A model is scored by elpd, the sum over pixels of log p(n_i | the other pixels). With draws theta_s
 of the whole frame's posterior, p(n_i | the others) is the harmonic mean of p(n_i | theta_s):
@@ -35,7 +37,7 @@ __all__ = ["Comparison", "Score", "compare"]
 # Pixels whose log-likelihood varies by less over the draws need no smoothing.
 SPREAD = 0.5
 
-# Draws of a pixel are held together: so many numbers at a time.
+# Numbers in memory at a time, as all draws of a pixel are needed together.
 BLOCK = 2**24
 
 # Differences of elpd below this, or below twice their standard error, decide nothing.
@@ -181,7 +183,11 @@ def _error_of_sum(values: Floats) -> float:
 def _leave_one_out(
     posterior: Posterior, chain: Chain, n_draws: int
 ) -> tuple[Floats, float, float, int]:
-    """elpd of every pixel, the effective number of parameters, the largest Pareto shape and how many are too large."""
+    """Score a model pixel by pixel.
+
+    Returns elpd of every pixel, the effective number of parameters, the largest Pareto shape, and
+    the number of pixels whose shape is too large.
+    """
     every = chain.draws()
     draws = every[np.linspace(0, len(every) - 1, min(n_draws, len(every))).round().astype(int)]
     effective = convergence(chain.chain[:, chain.burn_in :])[1].min()

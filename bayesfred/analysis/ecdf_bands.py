@@ -1,4 +1,4 @@
-"""Whether numbers are uniform on [0, 1]: bands that hold a whole empirical distribution function, exactly.
+"""Whether numbers are uniform on [0, 1]: exact bands for a whole empirical distribution function.
 
 The empirical distribution function of n uniform numbers, times n, is binomial at every z. A band
 made of pointwise central intervals, each with tails of at most g/2, holds the whole function with a
@@ -26,7 +26,10 @@ MOST_POINTS = 100
 
 
 def points(n: int) -> Floats:
-    """Where the distribution function of n numbers is looked at: at most 100 evenly spaced points inside (0, 1)."""
+    """Where the distribution function of n numbers is evaluated.
+
+    At most 100 evenly spaced points inside (0, 1).
+    """
     number = min(n, MOST_POINTS)
     return np.arange(1, number) / number
 
@@ -67,7 +70,10 @@ def band(n: int, probability: float = 0.95) -> tuple[Floats, Floats]:
 
 
 def uniformity(values: Floats) -> float:
-    """p-value of uniformity: the probability that a band which just touches these numbers' distribution is left by uniform ones.
+    """p-value of uniformity.
+
+    A band that just touches the distribution function of these numbers is left by that of uniform
+    numbers with this probability.
 
     Parameters
     ----------
@@ -97,7 +103,7 @@ def _limits(n: int, tail: float) -> tuple[Floats, Floats]:
 
 
 def _inside(n: int, tail: float) -> float:
-    """Probability that n uniform numbers' distribution stays within the pointwise limits at every point."""
+    """Probability that n uniform numbers stay within the pointwise limits at every point."""
     z = np.append(0.0, points(n))
     low, high = (np.append(0, limit).astype(int) for limit in _limits(n, tail))
     chance = np.ones(1)

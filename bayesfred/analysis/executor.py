@@ -1,10 +1,10 @@
-"""Many independent tasks over anything with `submit`: a process pool, a Dask cluster, MPI; kept as they finish.
+"""Many independent tasks over anything with `submit`: a process pool, a Dask cluster, MPI.
 
-A task is told a number. What it works on, the study, is sent to a worker when that worker says that
-it does not have it: once a worker, whatever the executor and whenever the worker joins. Task k's
-random numbers are those of `SeedSequence(seed).spawn`'s child k, so that answers do not depend on
-who works or in which order. Every finished task is a row of a table on disk before the next is
-waited for; a study that is stopped resumes behind its last whole row.
+A task is given a number. What it works on, the study, is sent to a worker when that worker says it
+lacks it: once for each worker, regardless of the executor and of when the worker joins.
+Task k's random numbers are those of `SeedSequence(seed).spawn`'s child k, so that answers do not
+depend on the workers or their order. Every finished task is a row of a table on disk before the
+next is waited for. A study that was stopped is resumed after its last complete row.
 """
 
 import hashlib
@@ -46,7 +46,10 @@ WAITING = 4  # tasks sent ahead for each worker that is known
 
 
 class Executor(Protocol):
-    """What runs tasks: of `concurrent.futures` executors and of a Dask client's `get_executor()`, the part that is used."""
+    """What runs tasks.
+
+    A `concurrent.futures` executor is one, and so is what a Dask client's `get_executor()` returns.
+    """
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> Any:
         """Begin a call and return its future."""
@@ -189,7 +192,10 @@ def run(
 def _answers(
     study: Study, key: str, todo: deque[int], executor: Executor
 ) -> Iterator[tuple[int, Answer]]:
-    """The answers as they come. So many tasks are sent ahead as keep the workers busy that have answered so far."""
+    """The answers as they come.
+
+    Enough tasks are sent ahead to keep busy all workers that have answered so far.
+    """
     finished: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
     waiting: set[Any] = set()
     workers: set[str] = set()
@@ -258,7 +264,10 @@ def _executor(executor: Executor | None, workers: int | None) -> Iterator[Execut
 
 
 def _follow() -> None:
-    """Begin a process of the pool: it ends with the one that keeps the answers, and not by a Ctrl-C, which goes to all of them."""
+    """Begin a process of the pool.
+
+    It ends with the process that keeps the answers, and not by a Ctrl-C, which reaches all of them.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -306,9 +315,15 @@ def cluster(address: str) -> Iterator[Executor]:
 def _progress(total: int, completed: int, show: bool) -> Iterator[Callable[[bool], None]]:
     """A bar that is told of every answer whether the task failed."""
     bar = Progress(
-        TextColumn("study"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[failed]}"), TimeElapsedColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True), console=Console(stderr=True), disable=not show,
-    )  # fmt: skip
+        TextColumn("study"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[failed]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        console=Console(stderr=True),
+        disable=not show,
+    )
     failures = 0
     with bar:
         task = bar.add_task("", total=total, completed=completed, failed="")

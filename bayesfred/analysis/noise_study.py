@@ -1,4 +1,4 @@
-"""How well a distortion can be known: fits of simulated frames at several noise levels, against the Cramer-Rao bound."""
+"""How well a distortion can be known: fits of simulated frames, against the Cramer-Rao bound."""
 
 import itertools
 import math
@@ -13,12 +13,10 @@ from scipy.special import ndtr
 
 from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.analysis.executor import Executor, run
+from bayesfred.analysis.noise_summary import summarise
 from bayesfred.analysis.study_helpers import (
-    LEVELS,
     Method,
     check,
-    coverage_error,
-    covered,
     draws,
     given,
     maximum,
@@ -44,7 +42,10 @@ ESS = 1000  # effective draws of every posterior
 
 @dataclass(frozen=True)
 class _Levels:
-    """The tasks of a noise study: every replicate of every cell, one replicate of all cells after the other."""
+    """The tasks of a noise study: every replicate of every cell.
+
+    The first replicate of all cells comes first, then the second.
+    """
 
     model: ForwardModel
     theta: tuple[float, ...]
@@ -143,7 +144,10 @@ class _Levels:
 
 
 def _spread(sources: SourceCatalog, n: int) -> npt.NDArray[np.intp]:
-    """The n brightest sources; among equally bright ones each is the farthest from those before it."""
+    """The n brightest sources.
+
+    Among equally bright ones each is the farthest from those before it.
+    """
     if n == len(sources):
         return np.arange(n)
     apart = np.full(n_all := len(sources), np.inf)
@@ -240,7 +244,7 @@ def noise_study(
     path : path-like
         The table, .ecsv, that keeps every frame's numbers as they come.
     seed : int
-        The same seed gives the same numbers, whoever computes them.
+        The same seed gives the same numbers, regardless of the executor.
     executor : object with submit(function, *args), optional
         A `concurrent.futures.Executor`, a Dask client's `get_executor()`, an
         `mpi4py.futures.MPIPoolExecutor`; by default a pool of fresh processes, for which a script
@@ -248,7 +252,7 @@ def noise_study(
     workers : int, optional
         Processes of that pool, by default one a core; 1 is this process alone.
     resume : bool
-        Go on with the study in the file; more replicates may be asked for.
+        Resume the study in the file; more replicates may be asked for.
     overwrite : bool
         Replace the file.
     progress : bool
@@ -278,7 +282,8 @@ def noise_study(
     ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     study = noise_study(
-    ...         model, [1e-3], [0.5, 50.0], replicates=2, path=f"{folder}/noise.ecsv", seed=1, workers=1, progress=False)
+    ...         model, [1e-3], [0.5, 50.0], replicates=2, path=f"{folder}/noise.ecsv", seed=1,
+    ...         workers=1, progress=False)
     >>> rows = study.cells["parameter"] == "f_ux"
     >>> study.cells["background"][rows].tolist(), bool(np.diff(study.cells["bound"][rows]) > 0)
     ([0.5, 50.0], True)
@@ -286,8 +291,8 @@ def noise_study(
     check("noise study", replicates, method)
     if nuisances.position_scatter:
         raise InputError(
-            "noise study: got position_scatter, expected sources at their places: fit without, or "
-            "calibrate instead"
+            "noise study: got position_scatter, expected sources at their positions: fit without, "
+            "or calibrate instead"
         )
     if psf_sigma and not isinstance(model.psf, GaussianPSF):
         raise InputError(
@@ -333,11 +338,18 @@ def noise_study(
             )
     meta = {"study": "noise", "seed": seed, "method": method, "replicates": replicates}
     record = run(
-        study, replicates * len(cells), path=path, meta=meta, executor=executor, workers=workers, resume=resume,
-        overwrite=overwrite, progress=progress,
-    )  # fmt: skip
+        study,
+        replicates * len(cells),
+        path=path,
+        meta=meta,
+        executor=executor,
+        workers=workers,
+        resume=resume,
+        overwrite=overwrite,
+        progress=progress,
+    )
     rows = record.columns
-    summary = _cells(study, rows)
+    summary = summarise(study.names, len(study.theta), study.cells, rows)
     whole = (summary["parameter"] == "theta") & (summary["frames"] > 1)
     message = (
         f"{rows['task'].size} frames, "
@@ -350,77 +362,3 @@ def noise_study(
         )
         message += f", 68 % intervals hold {coverage.min():.1%} to {coverage.max():.1%}"
     return NoiseStudy(Path(path), study.names, rows, summary, message)
-
-
-def _cells(study: _Levels, rows: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    """Every cell and parameter: what its frames say together."""
-    table: list[dict[str, Any]] = []
-    cell = rows["task"] % len(study.cells)
-    good = rows["message"] == ""
-    names, d = study.names, len(study.theta)
-    for j, variables in enumerate(study.cells):
-        mine = (cell == j) & good
-        n = int(mine.sum())
-        head: dict[str, Any] = {
-            **variables,
-            "frames": n,
-            "failed": int(((cell == j) & ~good).sum()),
-        }
-        for key in ("chi2", "lambda"):
-            head[key], head[f"{key}_error"] = _mean(
-                rows[key][mine][np.isfinite(rows[key][mine])]
-            )  # chi2 needs lambda > 0
-        unknown = dict.fromkeys(
-            ("truth", "width", "bias", "bias_error", "scatter", "bound"), math.nan
-        )
-        efficiency = d / _mean(rows["theta.distance"][mine])[0]
-        every = np.stack([rows[f"{term}.pit"][mine] for term in names[:d]], axis=1)
-        whole = {
-            "efficiency": efficiency,
-            "efficiency_error": efficiency * math.sqrt(2.0 / max(n * d, 1)),
-        }
-        table.append({**head, "parameter": "theta", **unknown, **whole, **_coverage(every)})
-        for name in names:
-            truth, estimate, sd, bound, pit = (
-                rows[f"{name}.{w}"][mine] for w in ("truth", "estimate", "sd", "bound", "pit")
-            )
-            bias, error = _mean(estimate - truth)
-            scatter, least = error * math.sqrt(n), math.sqrt(_mean(bound**2)[0])
-            efficiency = least**2 / scatter**2
-            own = {
-                "truth": _mean(truth)[0],
-                "width": _mean(sd)[0],
-                "bias": bias,
-                "bias_error": error,
-                "scatter": scatter,
-            }
-            own |= {
-                "bound": least,
-                "efficiency": efficiency,
-                "efficiency_error": efficiency * math.sqrt(2.0 / max(n - 1, 1)),
-            }
-            table.append({**head, "parameter": name, **own, **_coverage(pit[:, None])})
-    return {key: np.array([row[key] for row in table]) for key in table[0]}
-
-
-def _mean(values: Floats) -> tuple[float, float]:
-    """Mean and its error; NaN of fewer than two values."""
-    n = values.size
-    return (
-        (float(values.mean()), float(values.std(ddof=1)) / math.sqrt(n))
-        if n > 1
-        else (math.nan, math.nan)
-    )
-
-
-def _coverage(pit: Floats) -> dict[str, float]:
-    """Share of the intervals that hold the truth, and its error; those of one frame, a row, are not independent."""
-    out: dict[str, float] = {}
-    for level in LEVELS:
-        share, among = _mean(covered(pit, level).mean(axis=1))
-        key = f"coverage_{100 * level:.0f}"
-        out |= {
-            key: share,
-            f"{key}_error": among if pit.shape[1] > 1 else coverage_error(level, len(pit)),
-        }
-    return out

@@ -1,4 +1,6 @@
-"""Whether error bars hold: truths drawn from the prior, and where they lie among the draws of their frames' posteriors.
+"""Whether error bars hold, by simulation-based calibration.
+
+Truths are drawn from the prior and ranked among the draws of their frames' posteriors.
 
 Only for the exact posterior is the truth like one more draw, so that any error of model, optimiser
 or sampler shows in the ranks.
@@ -53,7 +55,11 @@ MOST_FAILED = 0.01  # share of frames without a posterior beyond which the other
 
 @dataclass(frozen=True)
 class _Calibration:
-    """The tasks of a calibration: a truth drawn from the prior, its frame, the posterior's draws, the truth's rank among them."""
+    """The tasks of a calibration.
+
+    Each draws a truth from the prior and simulates its frame; it samples the frame's posterior and
+    ranks the truth among the draws.
+    """
 
     posterior: Posterior
     fitted: Posterior
@@ -67,7 +73,10 @@ class _Calibration:
 
     @cached_property
     def _field(self) -> dict[str, Floats]:
-        """f and g at points of the field, as far as they depend on theta: they are linear in it, with these factors."""
+        """f and g at points of the field, as far as they depend on theta.
+
+        They are linear in theta, with these factors.
+        """
         distortion = self.posterior.model.polynomial
         places = np.rint(
             0.5 * np.array(self.posterior.model.detector.fine_shape[::-1]) * FIELD_POINTS
@@ -115,7 +124,10 @@ class _Calibration:
         return draws(posterior, maximum(posterior), self.method, seed, RANKED)
 
     def truth(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Parameters from the prior and a frame of theirs, drawn again where a map folds, as these have no prior probability."""
+        """Parameters from the prior and a frame of theirs.
+
+        They are drawn again where a map folds, as such parameters have no prior probability.
+        """
         for _ in range(REDRAWS):
             truth = np.array(
                 [prior.rvs(random_state=rng) for prior in self.posterior.prior.values()]
@@ -183,7 +195,7 @@ def calibrate_posterior(
     overwrite: bool = False,
     progress: bool = True,
 ) -> PosteriorCalibration:
-    """Simulation-based calibration: truths from the prior, ranked among the draws of their frames' posteriors.
+    """Simulation-based calibration: rank truths from the prior among the posterior's draws.
 
     Of each frame at least 200 draws an autocorrelation time apart are kept. With randomised ranks,
     the share of draws below the truth is exactly uniform if and only if truth and draws come from
@@ -239,7 +251,9 @@ def calibrate_posterior(
     ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
     >>> posterior = bf.Posterior(model, bf.simulate(model, [0.0], 2.0, seed=1))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     study = calibrate_posterior(posterior, replicates=20, path=f"{folder}/sbc.ecsv", seed=1, workers=1, progress=False)
+    ...     study = calibrate_posterior(
+    ...         posterior, replicates=20, path=f"{folder}/sbc.ecsv", seed=1, workers=1,
+    ...         progress=False)
     >>> study.calibrated, study.n, study.quantities["quantity"][:3].tolist()
     (True, 20, ['f_ux', 'background', 'log_likelihood'])
     """
@@ -252,9 +266,15 @@ def calibrate_posterior(
             f"{', '.join(posterior.parameter_names)}"
         )
     return _calibrate(
-        _Calibration(posterior, judged, method, seed), replicates, path=path, executor=executor, workers=workers, resume=resume,
-        overwrite=overwrite, progress=progress,
-    )  # fmt: skip
+        _Calibration(posterior, judged, method, seed),
+        replicates,
+        path=path,
+        executor=executor,
+        workers=workers,
+        resume=resume,
+        overwrite=overwrite,
+        progress=progress,
+    )
 
 
 def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCalibration:

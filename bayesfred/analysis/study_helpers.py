@@ -1,4 +1,4 @@
-"""What studies do with one simulated frame: fit it as a user would, and count intervals that hold."""
+"""What studies do with a simulated frame: fit it as users do, and count intervals that hold."""
 
 import math
 from typing import Literal, get_args

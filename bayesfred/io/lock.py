@@ -1,7 +1,7 @@
-"""One writer a chain file: a lock that says who holds it.
+"""One writer for each chain file: a lock that names its holder.
 
-The lock is the operating system's, which frees it when its holder dies. Who holds it stands in a
-file beside it, because not every version of filelock leaves the content of the lock file alone.
+The lock is the operating system's, which frees it when its holder dies. A second file names the
+holder, because some versions of filelock empty the lock file.
 """
 
 import os
@@ -15,7 +15,7 @@ import filelock
 
 from bayesfred.errors import InputError
 
-PATIENCE = 0.1  # seconds; a writer that was killed holds nothing, so there is nothing to wait for
+PATIENCE = 0.1  # seconds; the lock of a writer that was killed is free at once
 
 
 @contextmanager
@@ -30,12 +30,10 @@ def only_writer(path: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        If another process writes it, which is named, or its folder cannot be written.
+        If another process, which is named, is writing it, or its folder cannot be written.
     """
-    lock, holder = (
-        filelock.FileLock(path.with_name(f".{path.name}.lock"), PATIENCE),
-        path.with_name(f".{path.name}.writer"),
-    )
+    lock = filelock.FileLock(path.with_name(f".{path.name}.lock"), PATIENCE)
+    holder = path.with_name(f".{path.name}.writer")
     try:
         lock.acquire()
         since = datetime.now().astimezone().isoformat(" ", "seconds")
