@@ -18,28 +18,31 @@ from typing import Any, ClassVar, Literal, get_args
 import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaln
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
-from bayesfred.imaging.kernels.jacobian import Basis
-from bayesfred.imaging.kernels.render import image
+from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Optics, SourceNuisances, stride
+from bayesfred.imaging.kernels.render import render as render_sources
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
-from bayesfred.model.kernels.fisher import fisher
-from bayesfred.model.kernels.fluxes import Drawn, draw, log_likelihoods
-from bayesfred.model.kernels.gradient import gradient
-from bayesfred.model.kernels.likelihood import (
+from bayesfred.model.kernels.contexts import (
     LIMIT,
     MASKED,
-    Counts,
+    Frame,
+    Parameters,
+    Problem,
+    Rendered,
+    Turns,
+    Vectors,
     Workspace,
-    clear,
-    new_workspace,
+    parameters_of,
 )
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise, read_noise_model
+from bayesfred.model.kernels.evaluate import log_likelihoods, render
+from bayesfred.model.kernels.fisher import fisher
+from bayesfred.model.kernels.gradient import gradient
+from bayesfred.model.kernels.likelihood import clear, new_workspace
+from bayesfred.model.noise import Noise, PoissonNoise, read_noise_model
 
 FluxMode = Literal["fixed", "scale", "free"]
 
@@ -51,7 +54,7 @@ BACKGROUND_TERMS = (
     "background_uv",
     "background_v2",
 )
-SOURCE_NUISANCES = ("flux_scale", "offset_x", "offset_y", "psf_sigma", "position_scatter")
+SOURCE_NUISANCES = SourceNuisances._fields
 
 _pool: ThreadPoolExecutor | None = None
 
@@ -198,7 +201,7 @@ def _usable(
     model: ForwardModel,
     counts: Floats,
     mask: npt.ArrayLike | None,
-    noise: PoissonNoise | BackgroundNoise,
+    noise: Noise,
     nuisances: Nuisances,
 ) -> Flags:
     """The pixels for the likelihood, after checking that the frame can be explained at all."""
@@ -227,12 +230,7 @@ def _usable(
         raise InputError(
             f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them"
         )
-    if isinstance(noise, PoissonNoise) and noise.read_noise == 0 and counts[used].min() < 0:
-        raise InputError(
-            f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: check "
-            "gain and pedestal, give "
-            "read_noise, or mask these pixels"
-        )
+    noise.check(counts, used, nuisances.flux, nuisances.background_order)
     return used
 
 
@@ -266,7 +264,8 @@ class Posterior:
         By parameter name; the others get `priors.default_prior`. Parameters are independent a
         priori. A distortion that leaves a source without an image, or folds the frame (D <= 0)
         within two of the PSF's widths of one, has probability zero.
-    noise : PoissonNoise or BackgroundNoise
+    noise : Noise
+        `PoissonNoise`, `GaussianNoise`, `BackgroundNoise` or a model of your own.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is to be used.
     nuisances : Nuisances
@@ -297,7 +296,7 @@ class Posterior:
     model: ForwardModel
     counts: Floats
     prior: Mapping[str, Any]
-    noise: PoissonNoise | BackgroundNoise
+    noise: Noise
     mask: Flags
     nuisances: Nuisances
 
@@ -309,18 +308,10 @@ class Posterior:
         counts: npt.ArrayLike,
         *,
         prior: Mapping[str, Any] | None = None,
-        noise: PoissonNoise | BackgroundNoise = PoissonNoise(),
+        noise: Noise = PoissonNoise(),
         mask: npt.ArrayLike | None = None,
         nuisances: Nuisances = Nuisances(),
     ) -> None:
-        if isinstance(noise, BackgroundNoise) and (
-            nuisances.flux == "free" or nuisances.background_order
-        ):
-            raise InputError(
-                "noise: got BackgroundNoise with free fluxes or a varying background, expected "
-                "fixed or scaled fluxes and "
-                "background_order 0: use PoissonNoise"
-            )
         frame = np.array(counts, dtype=np.float64)
         used = _usable(model, frame, mask, noise, nuisances)
         for name, value in (
@@ -392,21 +383,11 @@ class Posterior:
         out = np.where(np.isnan(prior), -np.inf, prior)
         arguments = self._arguments(vectors)
         extrapolated = self._extrapolation and self._extrapolation.at(vectors)
-        turn = np.zeros(1, np.int64)
+        turns = Turns(np.zeros(1, np.int64), out)
 
         def evaluate() -> None:
             with self._workspace() as w:
-                log_likelihoods(
-                    self._optics,
-                    self._frame,
-                    w,
-                    *arguments,
-                    self._flux,
-                    self._free,
-                    extrapolated,
-                    turn,
-                    out,
-                )
+                log_likelihoods(self._problem, w, arguments, extrapolated, turns)
 
         helpers = [
             _threads().submit(evaluate)
@@ -422,7 +403,7 @@ class Posterior:
     def near(self, params: Floats, covariance: Floats) -> "Posterior":
         """The same posterior, with a `log_prob` that is several times faster around `params` where fluxes are free.
 
-        It foretells the most likely fluxes from those at `params`. Where that fails it looks for
+        It extrapolates the most likely fluxes from those at `params`. Where that fails it looks for
         them as usual; values differ by rounding and at most 5e-5, by some 1e-6 within a few
         standard deviations.
 
@@ -455,25 +436,15 @@ class Posterior:
         """
         if self.nuisances.profiled != 1:
             return self
-        arguments = [a[0] for a in self._arguments(self._vectors(params))]
-        unused = np.zeros(self._basis.row.size), np.zeros(6)
-        with self._drawn(arguments) as (w, drawn):
-            slope, z = gradient(
-                self._optics,
-                self._frame,
-                w,
-                drawn,
-                *arguments[1:],
-                self._free,
-                self._basis,
-                *unused,
-            )
+        out = np.zeros(self._basis.row.size), np.zeros(6)
+        with self._rendered(self._vectors(params)) as (w, rendered, parameters):
+            slope, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
         close = copy.copy(self)
         if np.isfinite(slope):
             object.__setattr__(
                 close,
                 "_extrapolation",
-                flux_extrapolation(self.fluxes, drawn.fitted, z[:, 0], params, covariance),
+                flux_extrapolation(self.fluxes, rendered, z[:, 0], params, covariance),
             )
         return close
 
@@ -492,34 +463,19 @@ class Posterior:
         vector = self._vectors(params)[0]
         if not np.isfinite(self.log_prior(vector)[0]):
             return np.full(vector.size, np.nan)
-        arguments = [a[0] for a in self._arguments(vector[None])]
         sources, background = np.zeros(self._basis.row.size), np.zeros(6)
-        with self._drawn(arguments) as (w, drawn):
-            slope, _ = gradient(
-                self._optics,
-                self._frame,
-                w,
-                drawn,
-                *arguments[1:],
-                self._free,
-                self._basis,
-                sources,
-                background,
-            )
+        with self._rendered(vector[None]) as (w, rendered, parameters):
+            out = sources, background
+            slope, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if np.isnan(slope):
             return np.full(vector.size, np.nan)
-        if isinstance(self.noise, BackgroundNoise):
-            level = arguments[2][0]
-            residual = self.counts - self.expected_counts(vector)
-            squares = float(np.sum(residual[self.mask] ** 2))
-            background[0] += 0.5 * (squares / level - self._frame.pixels) / level
         terms = len(self.nuisances.background_names)
         scatter = [slope] if self.nuisances.position_scatter else []
-        out = np.concatenate([sources, scatter, background[:terms]])[self._order]
+        slopes = np.concatenate([sources, scatter, background[:terms]])[self._order]
         if self.nuisances.flux == "scale":
-            out[self.parameter_names.index("flux_scale")] /= arguments[1][0]
-        out += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
-        return out
+            slopes[self.parameter_names.index("flux_scale")] /= parameters.nuisances.flux_scale
+        slopes += [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
+        return slopes
 
     def fisher(self, params: npt.ArrayLike) -> Floats:
         """Fisher information of the frame about the parameters, free fluxes profiled out; without the prior.
@@ -531,22 +487,10 @@ class Posterior:
         vector = self._vectors(params)[0]
         if not np.isfinite(self.log_prior(vector)[0]):
             return np.full((vector.size, vector.size), np.nan)
-        arguments = [a[0] for a in self._arguments(vector[None])]
-        terms = len(self.nuisances.background_names)
-        size = self._basis.row.size + terms
+        size = self._basis.row.size + len(self.nuisances.background_names)
         out = np.zeros((size, size))
-        with self._drawn(arguments) as (w, drawn):
-            known = fisher(
-                self._optics,
-                self._frame,
-                w,
-                drawn,
-                *arguments[1:],
-                terms,
-                self._free,
-                self._basis,
-                out,
-            )
+        with self._rendered(vector[None]) as (w, rendered, parameters):
+            known = fisher(self._problem, w, rendered, parameters, self._basis, out)
         if np.isnan(known):
             return np.full((vector.size, vector.size), np.nan)
         if (
@@ -555,13 +499,10 @@ class Posterior:
             k = self._basis.row.size
             out = np.insert(np.insert(out, k, 0.0, axis=0), k, 0.0, axis=1)
             out[k, k] = known
-        if isinstance(self.noise, BackgroundNoise):
-            k = self._basis.row.size
-            out[k, k] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
         if self.nuisances.flux == "scale":
             k = len(self.model.distortion.names)
-            out[k] /= arguments[1][0]
-            out[:, k] /= arguments[1][0]
+            out[k] /= parameters.nuisances.flux_scale
+            out[:, k] /= parameters.nuisances.flux_scale
         return out[np.ix_(self._order, self._order)]
 
     def information(self, params: npt.ArrayLike, fisher: Floats | None = None) -> Floats:
@@ -583,29 +524,23 @@ class Posterior:
             expected counts are negative.
         """
         vector = self._vectors(params)[0]
-        theta, nuisances, background = (a[0] for a in self._arguments(vector[None]))
-        scale, *offset, sigma, scatter = (float(value) for value in nuisances)
+        theta, nuisances, background = parameters_of(self._arguments(vector[None]), 0)
         flux = (
-            scale * self._flux
+            nuisances.flux_scale * self._flux
             if not self._free
             else self._flux * rng.gamma(2.0, 0.5, self._flux.size)
         )
         ny, nx = self.model.detector.shape
         optics, out = self._optics, np.zeros(ny * stride(nx))
-        unfolded = image(optics, theta, *offset, sigma, flux, out)
+        at_rest = nuisances._replace(position_scatter=0.0)
+        unfolded = render_sources(optics, theta, at_rest, flux, out)
         # a shift is as imaged: it moves the image, and leaves the distortion that of the
         # catalogue's position
-        if scatter:
-            by_x, by_y = scatter * rng.standard_normal((2, flux.size))
+        if nuisances.position_scatter:
+            by_x, by_y = nuisances.position_scatter * rng.standard_normal((2, flux.size))
             out[:] = 0.0
-            image(
-                optics._replace(x=optics.x + by_x, y=optics.y + by_y),
-                theta,
-                *offset,
-                sigma,
-                flux,
-                out,
-            )
+            moved = optics._replace(x=optics.x + by_x, y=optics.y + by_y)
+            render_sources(moved, theta, at_rest, flux, out)
         sources, level = (
             out.reshape(ny, -1)[:, :nx],
             self._polynomial(background) - self.noise.shift,
@@ -634,14 +569,12 @@ class Posterior:
 
     def _expected(self, params: npt.ArrayLike) -> tuple[Floats, Floats]:
         vector = self._vectors(params)[0]
-        arguments = [a[0] for a in self._arguments(vector[None])]
         ny, nx = self.model.detector.shape
-        with self._drawn(arguments) as (w, drawn):
+        with self._rendered(vector[None]) as (w, rendered, parameters):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
-        bad = 0.0 if drawn.extra > -np.inf else np.nan
-        return sources + self._polynomial(
-            arguments[2]
-        ) - self.noise.shift + bad, drawn.fitted.fluxes + bad
+        bad = 0.0 if rendered.extra > -np.inf else np.nan
+        level = self._polynomial(parameters.background) - self.noise.shift
+        return sources + level + bad, rendered.fluxes + bad
 
     def _polynomial(self, background: Floats) -> Floats:
         """The background polynomial at every pixel."""
@@ -673,7 +606,7 @@ class Posterior:
             )
         return vectors
 
-    def _arguments(self, vectors: Floats) -> tuple[Floats, Floats, Floats]:
+    def _arguments(self, vectors: Floats) -> Vectors:
         """Distortion coefficients, source nuisances and background coefficients, one row a parameter vector."""
         nuisances = np.zeros((len(vectors), len(SOURCE_NUISANCES)))
         background = np.zeros((len(vectors), len(BACKGROUND_TERMS)))
@@ -684,11 +617,8 @@ class Posterior:
                 if name in self.parameter_names:
                     values[:, k] = vectors[:, self.parameter_names.index(name)]
         background[:, 0] += self.noise.shift
-        return (
-            np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms]),
-            nuisances,
-            background,
-        )
+        theta = np.ascontiguousarray(vectors[:, : self.model.distortion.n_terms])
+        return Vectors(theta, nuisances, background)
 
     @contextmanager
     def _workspace(self) -> Iterator[Workspace]:
@@ -696,16 +626,17 @@ class Posterior:
         try:
             workspace = self._workspaces.get_nowait()
         except queue.Empty:
-            typical = self._arguments(self.start()[None])[1][0]
+            typical = parameters_of(self._arguments(self.start()[None]), 0).nuisances
             workspace = new_workspace(self._optics, typical, self._free)
         yield workspace
         self._workspaces.put(workspace)
 
     @contextmanager
-    def _drawn(self, arguments: list[Floats]) -> Iterator[tuple[Workspace, Drawn]]:
-        """A workspace in which the sources are drawn, for one set of arguments."""
+    def _rendered(self, vectors: Floats) -> Iterator[tuple[Workspace, Rendered, Parameters]]:
+        """A workspace in which the sources are rendered, for one parameter vector."""
+        parameters = parameters_of(self._arguments(vectors), 0)
         with self._workspace() as w:
-            yield w, draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
+            yield w, render(self._problem, w, parameters), parameters
             clear(w)
 
     @cached_property
@@ -748,26 +679,27 @@ class Posterior:
         )  # what None leaves out is not compiled
 
     @cached_property
-    def _frame(self) -> Counts:
+    def _problem(self) -> Problem:
+        return Problem(self._optics, self._frame, self._flux, self._free)
+
+    @cached_property
+    def _frame(self) -> Frame:
         ny, nx = self.model.detector.shape
         values = np.full((ny, stride(nx)), MASKED)
         values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, MASKED)
         used = (values > LIMIT).reshape(-1, SEGMENT)
-        clean = np.where(used, values.reshape(-1, SEGMENT), 0.0)
-        total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
-        return Counts(
-            values.ravel(), used.sum(axis=1).astype(float), total, squares,
-            float(used.sum()), float(total.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
+        total = np.where(used, values.reshape(-1, SEGMENT), 0.0).sum(axis=1)
+        noise, varies = self.noise.terms(values), self.nuisances.background_order > 0
+        return Frame(
+            values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
+            float(total.sum()), ny, nx, noise, varies,
+            everywhere=varies or not hasattr(noise, "unreached"),
         )  # fmt: skip
 
     @cached_property
     def _constant(self) -> float:
         """The part of the log-likelihood that depends on the counts alone."""
-        if isinstance(self.noise, BackgroundNoise):
-            return 0.0
-        return -float(
-            np.sum(gammaln(np.maximum(self.counts[self.mask] + self.noise.shift, 0.0) + 1.0))
-        )
+        return self.noise.constant(self.counts, self.mask)
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}
