@@ -10,7 +10,7 @@ from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
-from .model.noise import BackgroundNoise, PoissonNoise, simulate
+from .model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from .model.posterior import Nuisances, Posterior
 from .optimize.find_map import MapEstimate, find_map, reject_outliers
 from .sampling.chainfile import Chain, open_chain
@@ -24,6 +24,7 @@ __all__ = [
     "Detector",
     "Diagnostics",
     "ForwardModel",
+    "GaussianNoise",
     "GaussianPSF",
     "InputError",
     "LaplaceMove",

@@ -12,9 +12,9 @@ from scipy.special import rel_entr, xlogy
 from scipy.stats import norm, poisson
 
 from bayesfred.analysis.diagnostics import autocorrelation_time, diagnose
-from bayesfred.model.noise import BackgroundNoise
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise
 from bayesfred.model.posterior import Nuisances
-from bayesfred.optimize.fit_statistics import deviance_moments
+from bayesfred.model.noise.poisson import deviance_moments
 from bayesfred.sampling.convergence import convergence, effective_size, rank_rhat
 
 Floats = NDArray[np.float64]
@@ -240,7 +240,7 @@ def refits(flux: float, background: float, read_noise: float = 0.0, n: int = 300
             if read_noise
             else rng.poisson(mu).astype(float)
         )
-        posterior = linear_posterior(counts, SimpleNamespace(read_noise=read_noise))
+        posterior = linear_posterior(counts, PoissonNoise(read_noise))
         params = most_likely(counts, (flux, background), read_noise)
         out.append(diagnose(chain_at(params, posterior), target_ess=100.0))
     return out
@@ -307,7 +307,7 @@ def test_wrong_model_is_seen_and_masked_pixels_are_not() -> None:
     params = np.array([3000.0, 5.0])
     mask = np.ones(SHAPE, bool)
     mask[:5] = False
-    noise = SimpleNamespace(read_noise=0.0)
+    noise = PoissonNoise()
     bad = diagnose(chain_at(params, linear_posterior(counts, noise)), target_ess=100.0)
     good = diagnose(chain_at(params, linear_posterior(counts, noise, mask)), target_ess=100.0)
     for result, low, high in ((bad, 20.0, np.inf), (good, -4.0, 4.0)):
@@ -318,14 +318,14 @@ def test_wrong_model_is_seen_and_masked_pixels_are_not() -> None:
 
 @pytest.mark.parametrize(("scatter", "fitted"), [(False, 9), (True, 23)])
 def test_what_is_free_of_a_source_counts_as_fitted(scatter: bool, fitted: int) -> None:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.nuisances = Nuisances("free", position_scatter=scatter)
     posterior.model.sources.flux = np.ones(7)
     assert diagnose(chain_at(np.array([1.0, 5.0]), posterior)).n_fitted == fitted
 
 
 def test_a_varying_background_has_no_paper_statistic() -> None:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.nuisances = Nuisances(background_order=1)
     result = diagnose(chain_at(np.array([1.0, 5.0]), posterior))
     assert np.isnan(result.background_estimate) and np.isnan(result.chi2_paper)
@@ -346,7 +346,7 @@ def weighed(prior: Any, likelihood: Any, steps: int = 300) -> Any:
     log_prob = (
         prior.logpdf(draws[..., 0]) + likelihood.logpdf(draws[..., 0]) + norm.logpdf(draws[..., 1])
     )
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.log_prior = lambda x: prior.logpdf(x[:, 0])
     return diagnose(chain_at(np.array([1.0, 5.0]), posterior, chain=draws, log_prob=log_prob))
 
@@ -405,7 +405,7 @@ def test_narrow_priors_are_named_and_broad_ones_are_not() -> None:
 
 def test_sensitivity_needs_draws_that_vary() -> None:
     for chain in (np.ones((4, 15, 32, 2)), np.random.default_rng(15).normal(size=(2, 4, 4, 2))):
-        posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+        posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
         posterior.log_prior = lambda x: -0.5 * x[:, 0] ** 2
         result = diagnose(
             chain_at(
@@ -419,7 +419,7 @@ def test_sensitivity_needs_draws_that_vary() -> None:
 
 
 def healthy_chain(**changes: Any) -> Any:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     return chain_at(np.array([1.0, 5.0]), posterior, **changes)
 
 

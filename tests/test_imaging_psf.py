@@ -266,10 +266,10 @@ def test_every_pixel_above_the_tolerance_is_present(
 
 
 def test_windows_are_little_larger_than_needed(psf: PSF) -> None:
-    reach, x = psf.reach(1e-4), np.arange(-400, 401) / 10
+    reach, x = psf.support_radius(1e-4), np.arange(-400, 401) / 10
     beyond = np.hypot(x, x[:, None])[psf.density(x, x[:, None]) > 1e-4 * psf.peak].max()
     assert beyond <= reach <= beyond + 1.0
-    assert psf.reach(0.0) == np.inf
+    assert psf.support_radius(0.0) == np.inf
 
 
 # --------------------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.posterior import Nuisances
 from bayesfred.reporting import plots
 from bayesfred.reporting.html import write_report
@@ -50,7 +51,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         mask=mask,
         parameter_names=names,
         n_parameters=len(names),
-        noise=SimpleNamespace(read_noise=0.0),
+        noise=PoissonNoise(),
         nuisances=Nuisances(),
         model=model,
         log_prior=lambda draws: np.zeros(len(draws)),

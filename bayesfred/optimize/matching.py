@@ -258,10 +258,10 @@ class Field:
         u, v = position.T[:, :, None]
         matrix = np.zeros((2, len(sources), self.columns.size))
         matrix[0, :, : len(d.f_terms)] = (
-            o.f_lever[sources] * u ** o.f_powers[:, 0] * v ** o.f_powers[:, 1]
+            o.f_object_powers[sources] * u ** o.f_powers[:, 0] * v ** o.f_powers[:, 1]
         )
         matrix[1, :, len(d.f_terms) : d.n_terms] = (
-            o.g_lever[sources] * u ** o.g_powers[:, 0] * v ** o.g_powers[:, 1]
+            o.g_object_powers[sources] * u ** o.g_powers[:, 0] * v ** o.g_powers[:, 1]
         )
         if self.columns.size > d.n_terms:
             matrix[0, :, -2] = matrix[1, :, -1] = -1.0
