@@ -17,7 +17,7 @@ from bayesfred.model.kernels.extrapolate import Extrapolated, describe
 
 
 class FluxExtrapolation(NamedTuple):
-    """Most likely fluxes as a linear function of the parameters, and what is known of their Hessian H."""
+    """Most likely fluxes as a linear function of the parameters, and their Hessian H."""
 
     params: Floats  # (d,)
     fluxes: Floats  # (s,) there

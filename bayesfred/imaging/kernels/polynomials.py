@@ -58,7 +58,7 @@ def multiply(a, b, conserve, q, d):
 
 @inner(fastmath=FAST)
 def map_on_row(source, w, work, degree):
-    """Coefficients in t = u - u_peak on the row at v = v_peak + w: a, b, a_v and b_v in work[2:6]."""
+    """Fill work[2:6] with a, b, a_v and b_v in powers of t = u - u_peak at v = v_peak + w."""
     a, b = source.a, source.b
     ra, rb, rav, rbv = work[2], work[3], work[4], work[5]
     for m in range(len(degree) + 1):

@@ -38,9 +38,7 @@ def add_source(layout, s, rows, flux, canvas, alone):
         w = (js[i] - middle_v) * step - v
         t_low = (lows[i] - middle_u) * step - u
         row = out[at[i] : at[i] + sizes[i]]
-        stamp = (
-            None if alone is None else alone.image[alone.at[i] : alone.at[i] + sizes[i]]
-        )
+        stamp = None if alone is None else alone.image[alone.at[i] : alone.at[i] + sizes[i]]
         for y in range(offsets.size):
             fill_psf_row(psf, source, w + offsets[y], sigma, work, degrees)
             for x in range(offsets.size):

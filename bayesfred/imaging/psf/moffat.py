@@ -52,7 +52,9 @@ class MoffatProfile(NamedTuple):
 
 @dataclass(frozen=True)
 class MoffatPSF:
-    """Circular Moffat function, p(a, b) = (beta - 1) / (pi alpha^2) (1 + (a^2 + b^2) / alpha^2)^-beta.
+    """Circular Moffat function.
+
+    p(a, b) = (beta - 1) / (pi alpha^2) (1 + (a^2 + b^2) / alpha^2)^-beta.
 
     Its wings fall as a power and reach far: with beta 3 it is above 1e-8 of its peak within 21
     alpha. Beyond a tolerance t lies the part t^(1 - 1/beta) of the flux, which is not counted: 5e-6

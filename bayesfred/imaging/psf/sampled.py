@@ -41,7 +41,11 @@ class SplineProfile(NamedTuple):
         k = psf.scale
         i, x = _cell(psf.c.shape[1], k * a)
         j, y = _cell(psf.c.shape[0], k * b)
-        rows, slopes, v = _four(psf.c, j, i, _weights(x)), _four(psf.c, j, i, _slopes(x)), _weights(y)
+        rows, slopes, v = (
+            _four(psf.c, j, i, _weights(x)),
+            _four(psf.c, j, i, _slopes(x)),
+            _weights(y),
+        )
         return _inner(v, rows), -k * _inner(v, slopes), -k * _inner(_slopes(y), rows)
 
     @staticmethod
@@ -107,9 +111,18 @@ def _four(c: Any, j: Any, i: Any, w: Any) -> Any:
     """The weighted sums of four coefficients on four rows."""
     return (
         w[0] * c[j, i] + w[1] * c[j, i + 1] + w[2] * c[j, i + 2] + w[3] * c[j, i + 3],
-        w[0] * c[j + 1, i] + w[1] * c[j + 1, i + 1] + w[2] * c[j + 1, i + 2] + w[3] * c[j + 1, i + 3],
-        w[0] * c[j + 2, i] + w[1] * c[j + 2, i + 1] + w[2] * c[j + 2, i + 2] + w[3] * c[j + 2, i + 3],
-        w[0] * c[j + 3, i] + w[1] * c[j + 3, i + 1] + w[2] * c[j + 3, i + 2] + w[3] * c[j + 3, i + 3],
+        w[0] * c[j + 1, i]
+        + w[1] * c[j + 1, i + 1]
+        + w[2] * c[j + 1, i + 2]
+        + w[3] * c[j + 1, i + 3],
+        w[0] * c[j + 2, i]
+        + w[1] * c[j + 2, i + 1]
+        + w[2] * c[j + 2, i + 2]
+        + w[3] * c[j + 2, i + 3],
+        w[0] * c[j + 3, i]
+        + w[1] * c[j + 3, i + 1]
+        + w[2] * c[j + 3, i + 2]
+        + w[3] * c[j + 3, i + 3],
     )
 
 

@@ -1,1 +1,1 @@
-"""Compiled loops over counts: log-likelihood, its exact gradient, Fisher information, profiled fluxes."""
+"""Compiled loops over counts: log-likelihood, gradient, Fisher information, fluxes."""

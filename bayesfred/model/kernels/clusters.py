@@ -30,7 +30,7 @@ def bounding_boxes(fp):
 
 @inner()
 def _group(keys, size):
-    """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
+    """Indices in the order of their keys < size, and where each key's begin among them."""
     first = np.zeros(size + 2, np.int64)
     for i in range(keys.size):
         first[keys[i] + 2] += 1

@@ -113,7 +113,7 @@ class Profiled(NamedTuple):
 
 
 class Rendered(NamedTuple):
-    """The sources as they are rendered in a workspace's image, and what derivatives need of them."""
+    """The sources as rendered in a workspace's image, and what derivatives need of them."""
 
     # what profiling adds to the log-likelihood; -inf where a map folds, or the fluxes have no
     # maximum

@@ -47,9 +47,7 @@ def render(problem, w, parameters):
     o, nuisances = problem.optics, parameters.nuisances
     geometry = new_geometry(o)
     extra = 0.0
-    if not (
-        nuisances.position_scatter >= 0.0 and locate(o, parameters.theta, nuisances, geometry)
-    ):
+    if not (nuisances.position_scatter >= 0.0 and locate(o, parameters.theta, nuisances, geometry)):
         extra = -math.inf
         geometry.rows[:] = 0
     layout = lay_out(o, geometry, nuisances.psf_sigma)

@@ -215,9 +215,7 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
         h = factors[clusters.begin[c] : clusters.begin[c + 1]]
         patch = new_patch(w, touching, group, at)
         canvas = Canvas(patch.image, at)
-        cluster = _Cluster(
-            layout, touching, group, patch, canvas, fluxes, shifts, scale, scatter
-        )
+        cluster = _Cluster(layout, touching, group, patch, canvas, fluxes, shifts, scale, scatter)
         fill_excess(problem.frame, parameters.background, patch)
         _start(cluster)
         if not _maximize(problem.frame, parameters.background, cluster, h):

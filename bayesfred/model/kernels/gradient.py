@@ -1,4 +1,6 @@
-"""Exact gradient of the log-likelihood, the Laplace term included. F, K, B and H are those of `fluxes.py`.
+"""Exact gradient of the log-likelihood, the Laplace term included.
+
+F, K, B and H are those of `fluxes.py`.
 
 Gradient of the Laplace term. Per pixel let r be the score, W = -dr/dmu and C = -1/2 dW/dmu; of
 Poisson counts n/mu - 1, n/mu^2 and n/mu^3. For sources s, t let Q = H^-1, q_s = sum_t Q_st K_t, h =

@@ -52,9 +52,7 @@ def new_workspace(o, nuisances, free):
         samples = find_footprints(o, geometry).start[-1]
         more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
     flags = np.zeros(size // SEGMENT, np.uint8)
-    return Workspace(
-        np.zeros(size), flags, span, np.empty(size), np.empty(size), np.empty(more)
-    )
+    return Workspace(np.zeros(size), flags, span, np.empty(size), np.empty(size), np.empty(more))
 
 
 @inner()

@@ -1,4 +1,4 @@
-"""The pixels of a cluster, one after another: on every row the stretch that holds its footprints."""
+"""The pixels of a cluster, one after another: on every row all that its footprints span."""
 
 from typing import NamedTuple
 
