@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import types
 from numba.extending import overload
 
@@ -165,7 +164,7 @@ class GaussianNoise(_Gaussian):
                 f"frame's shape {counts.shape}"
             )
 
-    def at(self, pixels: npt.ArrayLike) -> "GaussianNoise":
+    def at(self, pixels: Any) -> "GaussianNoise":
         if isinstance(self.variance, float):
             return self
         return GaussianNoise(self.variance[pixels])
