@@ -10,7 +10,7 @@ from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
-from .model.noise import BackgroundNoise, PoissonNoise, simulate
+from .model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from .model.parameters import Nuisances
 from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
@@ -27,6 +27,7 @@ __all__ = [
     "Detector",
     "Diagnostics",
     "ForwardModel",
+    "GaussianNoise",
     "GaussianPSF",
     "InputError",
     "LaplaceMove",

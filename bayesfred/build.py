@@ -41,7 +41,7 @@ def catalogue(
     )
     half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
     beyond = np.abs([record.x, record.y]) - half  # pixels, negative inside
-    outside = (beyond > psf.reach(run.model.tolerance) + STRAY * half).any(axis=0)
+    outside = (beyond > psf.support_radius(run.model.tolerance) + STRAY * half).any(axis=0)
     kept = ~outside if not outside.all() else outside
     at_edge = kept & (beyond > -3.0 * psf.sigma).any(axis=0)
     numbers = (

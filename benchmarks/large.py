@@ -78,12 +78,11 @@ def problem() -> bf.Posterior:
 
 
 def kernel_share(posterior: bf.Posterior, params: np.ndarray) -> float:
-    """Share of one walker's likelihood that drawing the sources takes."""
-    arguments = [a[0] for a in posterior._arguments(params[None])]
+    """Share of one walker's likelihood that rendering the sources takes."""
     times = np.empty((5, 2))
     for row in times:
         start = time.thread_time()
-        with posterior._drawn(arguments):
+        with posterior._rendered(params[None]):
             pass
         middle = time.thread_time()
         posterior.log_prob(params)

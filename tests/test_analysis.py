@@ -20,12 +20,12 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model.noise import BackgroundNoise, simulate
+from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
+from bayesfred.model.noise.poisson import deviance_moments
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
-from bayesfred.optimize.fit_statistics import deviance_moments
 from bayesfred.sampling.convergence import convergence, effective_size, rank_rhat
 from bayesfred.sampling.sampler import sample
 
@@ -257,7 +257,7 @@ def refits(flux: float, background: float, read_noise: float = 0.0, n: int = 300
             if read_noise
             else rng.poisson(mu).astype(float)
         )
-        posterior = linear_posterior(counts, SimpleNamespace(read_noise=read_noise))
+        posterior = linear_posterior(counts, PoissonNoise(read_noise))
         params = most_likely(counts, (flux, background), read_noise)
         out.append(diagnose(chain_at(params, posterior), target_ess=100.0))
     return out
@@ -324,7 +324,7 @@ def test_wrong_model_is_seen_and_masked_pixels_are_not() -> None:
     params = np.array([3000.0, 5.0])
     mask = np.ones(SHAPE, bool)
     mask[:5] = False
-    noise = SimpleNamespace(read_noise=0.0)
+    noise = PoissonNoise()
     bad = diagnose(chain_at(params, linear_posterior(counts, noise)), target_ess=100.0)
     good = diagnose(chain_at(params, linear_posterior(counts, noise, mask)), target_ess=100.0)
     for result, low, high in ((bad, 20.0, np.inf), (good, -4.0, 4.0)):
@@ -335,14 +335,14 @@ def test_wrong_model_is_seen_and_masked_pixels_are_not() -> None:
 
 @pytest.mark.parametrize(("scatter", "fitted"), [(False, 9), (True, 23)])
 def test_what_is_free_of_a_source_counts_as_fitted(scatter: bool, fitted: int) -> None:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.nuisances = Nuisances("free", position_scatter=scatter)
     posterior.model.sources.flux = np.ones(7)
     assert diagnose(chain_at(np.array([1.0, 5.0]), posterior)).n_fitted == fitted
 
 
 def test_a_varying_background_has_no_paper_statistic() -> None:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.nuisances = Nuisances(background_order=1)
     result = diagnose(chain_at(np.array([1.0, 5.0]), posterior))
     assert np.isnan(result.background_estimate) and np.isnan(result.chi2_paper)
@@ -363,7 +363,7 @@ def weighed(prior: Any, likelihood: Any, steps: int = 300) -> Any:
     log_prob = (
         prior.logpdf(draws[..., 0]) + likelihood.logpdf(draws[..., 0]) + norm.logpdf(draws[..., 1])
     )
-    posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.log_prior = lambda x: prior.logpdf(x[:, 0])
     return diagnose(chain_at(np.array([1.0, 5.0]), posterior, chain=draws, log_prob=log_prob))
 
@@ -422,7 +422,7 @@ def test_narrow_priors_are_named_and_broad_ones_are_not() -> None:
 
 def test_sensitivity_needs_draws_that_vary() -> None:
     for chain in (np.ones((4, 15, 32, 2)), np.random.default_rng(15).normal(size=(2, 4, 4, 2))):
-        posterior = linear_posterior(np.full(SHAPE, 5.0), SimpleNamespace(read_noise=0.0))
+        posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
         posterior.log_prior = lambda x: -0.5 * x[:, 0] ** 2
         result = diagnose(
             chain_at(
@@ -437,7 +437,7 @@ def test_sensitivity_needs_draws_that_vary() -> None:
 
 def healthy_chain(**changes: Any) -> Any:
     counts = np.random.default_rng(16).poisson(profile() + 5.0).astype(float)
-    posterior = linear_posterior(counts, SimpleNamespace(read_noise=0.0))
+    posterior = linear_posterior(counts, PoissonNoise())
     return chain_at(np.array([1.0, 5.0]), posterior, **changes)
 
 

@@ -1,4 +1,4 @@
-"""Moffat and sampled PSFs against slow images, closed forms, scipy's splines and refits; the PSF measured on a frame."""
+"""Moffat and sampled PSFs against slow images, closed forms, scipy's splines and refits."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ def lopsided(sigma: float, oversampling: int = 4, half: float = 6.0) -> Floats:
 
 
 def spline(psf: SampledPSF, a: Floats, b: Floats) -> Floats:
-    """The cubic spline through the samples, zero two samples beyond them, by scipy; scaled to unit volume."""
+    """The cubic spline through the samples by scipy, scaled to unit volume.
+
+    It is zero two samples beyond them.
+    """
     n = len(psf.values)
     samples = np.arange(n) - (n - 1) / 2
     knots = (
@@ -151,7 +154,10 @@ def test_sampled_psf_interpolates_its_samples() -> None:
 
 
 def test_sampled_gaussian_is_nearly_the_gaussian() -> None:
-    """With samples 1/8 sigma apart the spline errs by (1/8)^4 / 384 times the fourth derivatives, 6 together: 4e-6 of the peak."""
+    """With samples 1/8 sigma apart the spline errs by 4e-6 of the peak.
+
+    That is (1/8)^4 / 384 times the fourth derivatives, 6 together.
+    """
     x = np.arange(-56, 57) / 4
     model = ForwardModel(
         Detector(SHAPE),
@@ -187,7 +193,10 @@ def test_distortion_that_is_not_polynomial_has_any_psf(psf: PSF, log: bool) -> N
     ids=["1.5", "4", "sampled"],
 )
 def test_box_pixels_equal_fine_quadrature(psf: PSF, binning: int) -> None:
-    """A spline is no polynomial within a pixel: where samples are 1/7 sigma apart that costs 1e-5 of the peak."""
+    """A spline is no polynomial within a pixel.
+
+    Where samples are 1/7 sigma apart that costs 1e-5 of the peak.
+    """
     rng = np.random.default_rng(82)
     detector = Detector((22, 29), binning, "box")
     model = ForwardModel(
@@ -267,10 +276,10 @@ def test_every_pixel_above_the_tolerance_is_present(
 
 
 def test_windows_are_little_larger_than_needed(psf: PSF) -> None:
-    reach, x = psf.reach(1e-4), np.arange(-400, 401) / 10
+    reach, x = psf.support_radius(1e-4), np.arange(-400, 401) / 10
     beyond = np.hypot(x, x[:, None])[psf.density(x, x[:, None]) > 1e-4 * psf.peak].max()
     assert beyond <= reach <= beyond + 1.0
-    assert psf.reach(0.0) == np.inf
+    assert psf.support_radius(0.0) == np.inf
 
 
 # --------------------------------------------------------------------------------------------------
@@ -288,7 +297,7 @@ CASES = {
 def make_posterior(
     psf: PSF, nuisances: Nuisances, detector: Detector, seed: int
 ) -> tuple[Posterior, Floats]:
-    """A frame of nine sources drawn from the model itself, which the tests above hold to the formulas."""
+    """A frame of nine sources from the model itself, which is tested above."""
     rng = np.random.default_rng(seed)
     model = ForwardModel(detector, SourceCatalog.grid(3, 17.0, 2e4), psf, MIRRORED, tolerance=0.0)
     theta = random_theta(rng, MIRRORED, detector.fine_shape, 0.3)
@@ -342,7 +351,7 @@ def test_width_is_that_of_a_wider_psf() -> None:
 
 
 def test_refits_scatter_as_the_covariance_says(psf: PSF) -> None:
-    """The mean of 20 Mahalanobis distances in a fit of 15 parameters, in its own Monte Carlo errors."""
+    """The mean of 20 Mahalanobis distances of 15 parameters, in its own Monte Carlo errors."""
     deviations, covariances = [], []
     for seed in range(20):
         posterior, truth = make_posterior(psf, *CASES["scale"], 100 + seed)

@@ -25,14 +25,14 @@ print(image_positions(model.optics(), model.sources.x * 5e-5, 0.0, 0.0, 3.0)[0, 
 """
 
 
-def position(package: Path, *arguments: str) -> float:
-    """Where the copy of the package images a source."""
+def position(package: Path, *arguments: str, program: str = RUN) -> float:
+    """What a program prints that uses the copy of the package: by default a source's position."""
     env = {
         name: value
         for name, value in os.environ.items()
         if name not in ("NUMBA_CACHE_DIR", "PYTHONPATH")
     }
-    command, folder = [sys.executable, "-c", RUN, *arguments], package.parent
+    command, folder = [sys.executable, "-c", program, *arguments], package.parent
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=True)
     return float(done.stdout)
 
@@ -52,3 +52,49 @@ def test_an_edited_kernel_is_compiled_again(tmp_path: Path, arguments: tuple[str
         text.replace("return value, c_u, c_v", "return value + 1.0, c_u, c_v"), encoding="utf-8"
     )
     assert position(package, *arguments) == pytest.approx(19.6 if arguments else 18.6, abs=1e-9)
+
+
+FAMILY = """
+import math
+from typing import NamedTuple
+
+class Profile(NamedTuple):
+    norm: float
+
+    @staticmethod
+    def value(psf, a, b):
+        return math.exp(-0.5 * (a * a + b * b))
+"""
+
+OUTSIDE = """
+import sys
+from bayesfred.imaging.kernels import compilation
+if "numba alone" in sys.argv:
+    compilation._Cache = compilation.FunctionCache
+import bayesfred as bf
+from family import Profile
+
+class PSF(bf.GaussianPSF):
+    profile = property(lambda self: Profile(0.5))
+
+model = bf.ForwardModel(
+    bf.Detector((9, 9)), bf.SourceCatalog([0.0], [0.0], [1.0]), PSF(1.0),
+    bf.PolynomialDistortion([(1, 0, 0, 0)], []))
+print(model.expected_counts([0.0])[4, 4])
+"""
+
+
+@pytest.mark.parametrize("arguments", [(), ("numba alone",)])
+def test_an_edited_psf_from_outside_is_compiled_again(
+    tmp_path: Path, arguments: tuple[str, ...]
+) -> None:
+    """Negative control: numba's own cache knows the loops' source files alone."""
+    package, family = tmp_path / "bayesfred", tmp_path / "family.py"
+    shutil.copytree(
+        Path(bayesfred.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    family.write_text(FAMILY, encoding="utf-8")
+    assert position(package, *arguments, program=OUTSIDE) == pytest.approx(0.5)
+    family.write_text(FAMILY.replace("return math", "return 2.0 * math"), encoding="utf-8")
+    value = position(package, *arguments, program=OUTSIDE)
+    assert value == pytest.approx(0.5 if arguments else 1.0)

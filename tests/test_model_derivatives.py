@@ -24,7 +24,7 @@ from test_model import (
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.noise import BackgroundNoise, GaussianNoise, PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 
@@ -83,6 +83,25 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
         BackgroundNoise(),
         3.0,
     ),
+    "gaussian": (isolated(), Nuisances("scale", psf_sigma=True), GaussianNoise(20.0), 3.0),
+    "gaussian, curved": (
+        isolated(),
+        Nuisances("scale", background_order=2),
+        GaussianNoise(20.0),
+        3.0,
+    ),
+    "variance image": (
+        isolated(),
+        Nuisances("scale", offset=True),
+        GaussianNoise(np.random.default_rng(30).uniform(5.0, 50.0, (64, 80))),
+        3.0,
+    ),
+    "free, gaussian": (
+        touching(),
+        FREE_AND_ALL,
+        GaussianNoise(np.random.default_rng(31).uniform(5.0, 50.0, (60, 75))),
+        3.0,
+    ),
     "footprint": (isolated(), Nuisances(footprint=9.0), PoissonNoise(), 3.0),
     "binned": (overlapping(detector=Detector((20, 25), 3)), EVERYTHING, PoissonNoise(), 20.0),
     "box": (overlapping(detector=Detector((30, 37), 2, "box")), EVERYTHING, PoissonNoise(), 9.0),
@@ -137,9 +156,8 @@ def full_information(posterior: Posterior, params: Floats, fluxes: Floats | None
         columns += [dense_image(model, named, one, order) for one in np.eye(fluxes.size)]
     jacobian = np.stack(columns)[:, posterior.mask]
     background = background_image(shape, named)[posterior.mask]
-    jacobian_weighted = jacobian * posterior.noise.fisher_weight(
-        mean(params)[posterior.mask], background
-    )
+    noise = posterior.noise.at(posterior.mask)
+    jacobian_weighted = jacobian * noise.fisher_weight(mean(params)[posterior.mask], background)
     information = jacobian_weighted @ jacobian.T
     if isinstance(posterior.noise, BackgroundNoise):  # the background is the variance, too
         k = posterior.parameter_names.index("background")
@@ -164,7 +182,14 @@ def test_fisher_is_that_of_the_dense_jacobian(case: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "case", ["free, isolated", "free, touching", "free, overlapping", "free, few photons"]
+    "case",
+    [
+        "free, isolated",
+        "free, touching",
+        "free, overlapping",
+        "free, few photons",
+        "free, gaussian",
+    ],
 )
 def test_fisher_with_free_fluxes_is_the_schur_complement(case: str) -> None:
     model, nuisances, noise, background = CASES[case]

@@ -22,6 +22,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
@@ -56,7 +57,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         mask=mask,
         parameter_names=names,
         n_parameters=len(names),
-        noise=SimpleNamespace(read_noise=0.0),
+        noise=PoissonNoise(),
         nuisances=Nuisances(),
         model=model,
         log_prior=lambda draws: np.zeros(len(draws)),

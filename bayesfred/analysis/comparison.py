@@ -225,8 +225,6 @@ def _log_likelihoods(posterior: Posterior, draws: Floats) -> Iterator[Floats]:
     """Log-likelihood of every pixel in use, draw by draw."""
     used = posterior.mask
     counts = posterior.counts[used]
-    constant = posterior.parameter_names.index("background")
+    noise, constant = posterior.noise.at(used), posterior.parameter_names.index("background")
     for draw in draws:
-        yield posterior.noise.log_likelihood(
-            counts, posterior.expected_counts(draw)[used], draw[constant]
-        )
+        yield noise.log_likelihood(counts, posterior.expected_counts(draw)[used], draw[constant])

@@ -294,7 +294,7 @@ def cluster(address: str) -> Iterator[Executor]:
         If Dask's `distributed` is not installed, or nothing answers there.
     """
     try:
-        from distributed import Client
+        from distributed import Client  # noqa: PLC0415 - an optional dependency
     except ImportError:
         raise InputError(
             "--scheduler: distributed is not installed, expected it: pip install 'bayesfred[dask]'"

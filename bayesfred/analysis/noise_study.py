@@ -26,7 +26,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
@@ -51,7 +51,7 @@ class _Levels:
     theta: tuple[float, ...]
     cells: tuple[dict[str, float], ...]
     method: Method
-    noise: PoissonNoise | BackgroundNoise
+    noise: Noise
     nuisances: Nuisances
     prior: Mapping[str, Any] | None
     mask: Flags | None
@@ -199,7 +199,7 @@ def noise_study(
     exposure: Sequence[float] = (),
     replicates: int = 50,
     method: Method = "laplace",
-    noise: PoissonNoise | BackgroundNoise = PoissonNoise(),
+    noise: Noise = PoissonNoise(),
     nuisances: Nuisances = Nuisances(),
     prior: Mapping[str, Any] | None = None,
     mask: npt.ArrayLike | None = None,

@@ -1,11 +1,11 @@
 """The forward model: distortion coefficients to expected counts, and their derivatives.
 
-    mu(u, v) = background + sum_s F_s p(u - x_s + f, v - y_s + g) |D|,    D = (1 + f_u)(1 + g_v) -
-    f_v g_u
+    mu(u, v) = background + sum_s F_s p(u - x_s + f, v - y_s + g) |D|,
+    D = (1 + f_u)(1 + g_v) - f_v g_u
 
 |D| makes each source's kernel integrate to one over the image, the constraint that Sun & Zhou state
 below their Eq. 1; their simulated kernel leaves it out, and so does `conserve_flux=False`. The sums
-over pixels are in `kernels`; `inference/posterior.py` compares the result with counts.
+over pixels are in `kernels`; `model` compares the result with counts.
 """
 
 import math
@@ -21,9 +21,9 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import Distortion, PolynomialDistortion
-from bayesfred.imaging.kernels.geometry import Optics, stride
-from bayesfred.imaging.kernels.jacobian import Basis, jacobian
-from bayesfred.imaging.kernels.render import image
+from bayesfred.imaging.kernels.contexts import Basis, Degrees, Optics, SourceNuisances, stride
+from bayesfred.imaging.kernels.jacobian import jacobian
+from bayesfred.imaging.kernels.render import render
 from bayesfred.imaging.psf import FWHM, PSF
 from bayesfred.io.serialize import serializable
 
@@ -43,8 +43,8 @@ class ForwardModel:
         Geometry and pixel response of the recorded frame.
     sources : SourceCatalog
         Positions (pixel) and fluxes (counts) in the object plane.
-    psf : GaussianPSF, MoffatPSF or SampledPSF
-        Reference PSF at the axis.
+    psf : PSF
+        Reference PSF at the axis: `GaussianPSF`, `MoffatPSF`, `SampledPSF` or another family.
     distortion : Distortion
         The displacements f and g. One that is not a `PolynomialDistortion` can be simulated, not
         fitted: it has expected counts alone.
@@ -104,7 +104,10 @@ class ForwardModel:
         return self.distortion
 
     def optics(self, narrowest: float | None = None) -> Optics:
-        """The model as the compiled loops need it, with pixels integrated well for PSFs of widths down to `narrowest` (pixel)."""
+        """The model as the compiled loops need it.
+
+        Pixels are integrated well for PSFs of widths down to `narrowest` (pixel).
+        """
         f = np.array(self.polynomial.f_terms, dtype=np.int64).reshape(-1, 4)
         g = np.array(self.polynomial.g_terms, dtype=np.int64).reshape(-1, 4)
         degree = max(1, int(np.concatenate([f, g])[:, 2:].max()))
@@ -120,18 +123,20 @@ class ForwardModel:
             y=self.sources.y,
             f_powers=f[:, 2:].copy(),
             g_powers=g[:, 2:].copy(),
-            f_lever=np.ascontiguousarray(x ** f[:, 0] * y ** f[:, 1]),
-            g_lever=np.ascontiguousarray(x ** g[:, 0] * y ** g[:, 1]),
+            f_object_powers=np.ascontiguousarray(x ** f[:, 0] * y ** f[:, 1]),
+            g_object_powers=np.ascontiguousarray(x ** g[:, 0] * y ** g[:, 1]),
             offsets=offsets,
             weights=weights,
             step=float(self.detector.binning),
             ny=ny,
             nx=nx,
-            reach=self.psf.reach(self.tolerance) / self.psf.sigma,
+            support_radius=self.psf.support_radius(self.tolerance) / self.psf.sigma,
             ramp=self.detector.binning * np.arange(stride(nx), dtype=np.float64),
-            degree=(0,) * degree,
-            q_degree=(0,) * (2 * degree),
-            d_degree=(0,) * (2 * degree - 1) if self.conserve_flux else (),
+            degrees=Degrees(
+                ab=(0,) * degree,
+                q=(0,) * (2 * degree),
+                d=(0,) * (2 * degree - 1) if self.conserve_flux else (),
+            ),
         )
 
     @cached_property
@@ -145,7 +150,7 @@ class ForwardModel:
         f = list(dict.fromkeys([t[2:] for t in d.f_terms] + constant))
         g = list(dict.fromkeys([t[2:] for t in d.g_terms] + constant))
         index = [f.index(t[2:]) for t in d.f_terms] + [len(f) + g.index(t[2:]) for t in d.g_terms]
-        levers = [self._optics.f_lever, self._optics.g_lever]
+        factors = [self._optics.f_object_powers, self._optics.g_object_powers]
         for name in nuisances:
             if name == "offset_x":  # the offsets enter a and b with a minus
                 index.append(f.index((0, 0)))
@@ -153,12 +158,12 @@ class ForwardModel:
                 index.append(len(f) + g.index((0, 0)))
             else:
                 index.append(len(f) + len(g) + ("flux_scale", "psf_sigma").index(name))
-            levers.append(-ones if name.startswith("offset") else ones)
+            factors.append(-ones if name.startswith("offset") else ones)
         return Basis(
             f=np.array(f, dtype=np.int64).reshape(-1, 2),
             g=np.array(g, dtype=np.int64).reshape(-1, 2),
             row=np.array(index, dtype=np.int64),
-            lever=np.ascontiguousarray(np.concatenate(levers, axis=1)),
+            factors=np.ascontiguousarray(np.concatenate(factors, axis=1)),
         )
 
     def expected_counts(self, theta: npt.ArrayLike, background: float = 0.0) -> Floats:
@@ -183,19 +188,12 @@ class ForwardModel:
         if not isinstance(self.distortion, PolynomialDistortion):
             return self._every_pixel() + background
         out = np.full(ny * stride(nx), float(background))
-        image(
-            self._optics,
-            self._monomial_coefficients(theta),
-            0.0,
-            0.0,
-            self.psf.sigma,
-            self.sources.flux,
-            out,
-        )
+        nuisances = SourceNuisances(1.0, 0.0, 0.0, self.psf.sigma, 0.0)
+        render(self._optics, self._monomial_coefficients(theta), nuisances, self.sources.flux, out)
         return out.reshape(ny, -1)[:, :nx]
 
     def _every_pixel(self) -> Floats:
-        """The sources' image without compiled loops: every pixel for every source, any distortion."""
+        """The sources' image without compiled loops: every pixel and source, any distortion."""
         offsets, weights = self.detector.quadrature(*self.psf.core)
         u, v = (np.add.outer(centres, offsets) for centres in self.detector.pixel_centres())
         u, v = u[None, None], v[:, :, None, None]

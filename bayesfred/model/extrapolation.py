@@ -1,8 +1,8 @@
-"""Where free fluxes have their maximum, extrapolated from one parameter vector and how they change around it.
+"""Where free fluxes have their maximum, extrapolated from one parameter vector.
 
 The most likely fluxes are a smooth function of the other parameters. Within a posterior's width it
 is nearly linear: what its secants leave is little enough for one Newton step, see
-`kernels/extrapolated.py`.
+`kernels/extrapolate.py`.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,12 @@ from scipy import linalg
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.model.kernels.clusters import Clusters
+from bayesfred.model.kernels.contexts import Clusters, Rendered
 from bayesfred.model.kernels.extrapolate import Extrapolated, describe
-from bayesfred.model.kernels.fluxes import Fitted
 
 
 class FluxExtrapolation(NamedTuple):
-    """Most likely fluxes as a linear function of the parameters, and what is known of their Hessian H."""
+    """Most likely fluxes as a linear function of the parameters, and their Hessian H."""
 
     model: ForwardModel  # whose sources these are
     params: Floats  # (d,)
@@ -38,15 +37,15 @@ class FluxExtrapolation(NamedTuple):
 def flux_extrapolation(
     model: ForwardModel,
     fluxes_at: Callable[[Floats], Floats],
-    fitted: Fitted,
+    rendered: Rendered,
     z: Floats,
     params: Floats,
     covariance: Floats,
 ) -> FluxExtrapolation | None:
-    """From the fluxes at `params` and a standard deviation to either side along every whitened axis; None without a covariance.
+    """From the fluxes at `params` and a standard deviation to either side along whitened axes.
 
     Along axes on which there are none, because the map folds or the background ends, they are taken
-    for constant. z is that of `kernels/gradient.py`.
+    as constant. z is that of `kernels/gradient.py`. Without a covariance there is no extrapolation.
     """
     try:
         axes = linalg.cholesky(covariance, lower=True)
@@ -56,6 +55,7 @@ def flux_extrapolation(
         [0.5 * (fluxes_at(params + axis) - fluxes_at(params - axis)) for axis in axes.T], axis=1
     )
     slope = linalg.solve_triangular(axes, np.nan_to_num(change).T, trans="T", lower=True).T
-    return FluxExtrapolation(
-        model, params, fitted.fluxes, slope, fitted.clusters, describe(fitted, z)
-    )
+    profiled, fluxes = rendered.profiled, rendered.fluxes
+    assert profiled is not None
+    hessian = describe(profiled, fluxes, z)
+    return FluxExtrapolation(model, params, fluxes, slope, profiled.touching.clusters, hessian)

@@ -13,26 +13,29 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import gammaln
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.kernels.geometry import SEGMENT, Optics, stride
-from bayesfred.imaging.kernels.jacobian import Basis
-from bayesfred.imaging.kernels.render import image
+from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Optics, stride
+from bayesfred.imaging.kernels.render import render as render_sources
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
-from bayesfred.model.kernels.fisher import fisher
-from bayesfred.model.kernels.fluxes import Drawn, draw, log_likelihoods
-from bayesfred.model.kernels.gradient import gradient
-from bayesfred.model.kernels.likelihood import (
+from bayesfred.model.kernels.contexts import (
     LIMIT,
     MASKED,
-    Counts,
+    Frame,
+    Parameters,
+    Problem,
+    Rendered,
+    Turns,
+    Vectors,
     Workspace,
-    clear,
-    new_workspace,
+    parameters_of,
 )
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.kernels.evaluate import log_likelihoods, render
+from bayesfred.model.kernels.fisher import fisher
+from bayesfred.model.kernels.gradient import gradient
+from bayesfred.model.kernels.likelihood import clear, new_workspace
+from bayesfred.model.noise import Noise
 from bayesfred.model.parameters import (
     BACKGROUND_POWERS,
     BACKGROUND_TERMS,
@@ -41,8 +44,6 @@ from bayesfred.model.parameters import (
     Parameter,
 )
 from bayesfred.model.threads import share
-
-Arguments = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ class FrameLikelihood:
     ----------
     model : ForwardModel
     counts : ndarray, shape (ny, nx), counts; finite
-    noise : PoissonNoise or BackgroundNoise
+    noise : Noise
     mask : ndarray of bool, shape (ny, nx)
         Pixels in the likelihood.
     nuisances : Nuisances
@@ -67,7 +68,7 @@ class FrameLikelihood:
 
     model: ForwardModel
     counts: Floats
-    noise: PoissonNoise | BackgroundNoise
+    noise: Noise
     mask: Flags
     nuisances: Nuisances
     parameters: tuple[Parameter, ...]
@@ -90,14 +91,11 @@ class FrameLikelihood:
         out = np.where(wanted, 0.0, -np.inf)
         arguments = self._arguments(vectors)
         extrapolated = self.extrapolation and self.extrapolation.at(vectors)
-        turn = np.zeros(1, np.int64)
+        turns = Turns(np.zeros(1, np.int64), out)
 
         def evaluate() -> None:
             with self._workspace() as w:
-                log_likelihoods(
-                    self._optics, self._frame, w, *arguments, self._flux, self._free,
-                    extrapolated, turn, out,
-                )  # fmt: skip
+                log_likelihoods(self._problem, w, arguments, extrapolated, turns)
 
         share(evaluate, len(vectors))
         return out + self._constant
@@ -117,57 +115,39 @@ class FrameLikelihood:
         """
         if self.nuisances.profiled != 1:
             return self
-        arguments = self._one(params)
-        unused = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
-        with self._rendered(arguments) as (w, drawn):
-            slope, z = gradient(
-                self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis,
-                *unused,
-            )  # fmt: skip
+        out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
+        with self._rendered(params) as (w, rendered, parameters):
+            slope, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if not np.isfinite(slope):
             return replace(self, extrapolation=None)
         extrapolation = flux_extrapolation(
-            self.model, self.fluxes, drawn.fitted, z[:, 0], params, covariance
+            self.model, self.fluxes, rendered, z[:, 0], params, covariance
         )
         return replace(self, extrapolation=extrapolation)
 
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
-        arguments = self._one(params)
         sources, background = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
-        with self._rendered(arguments) as (w, drawn):
-            slope, _ = gradient(
-                self._optics, self._frame, w, drawn, *arguments[1:], self._free, self._basis,
-                sources, background,
-            )  # fmt: skip
+        with self._rendered(params) as (w, rendered, parameters):
+            out = sources, background
+            slope, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if np.isnan(slope):
             return np.full(len(self.parameters), np.nan)
-        if isinstance(self.noise, BackgroundNoise):
-            level = arguments[2][0]
-            residual = self.counts - self.expected_counts(params)
-            squares = float(np.sum(residual[self.mask] ** 2))
-            background[0] += 0.5 * (squares / level - self._frame.pixels) / level
         return np.asarray(np.concatenate([sources, [slope], background]) @ self._chain_rule(params))
 
     def fisher(self, params: Floats) -> Floats:
         """Fisher information, free fluxes profiled out, shape (d, d); NaN where there is none."""
-        arguments = self._one(params)
         sources, terms = self._basis.row.size, len(self.nuisances.background_names)
-        known_part = np.zeros((sources + terms, sources + terms))
-        with self._rendered(arguments) as (w, drawn):
-            known = fisher(
-                self._optics, self._frame, w, drawn, *arguments[1:], terms, self._free,
-                self._basis, known_part,
-            )  # fmt: skip
+        others = np.zeros((sources + terms, sources + terms))
+        with self._rendered(params) as (w, rendered, parameters):
+            known = fisher(self._problem, w, rendered, parameters, self._basis, others)
         if np.isnan(known):
             return np.full((len(self.parameters),) * 2, np.nan)
-        if isinstance(self.noise, BackgroundNoise):
-            known_part[sources, sources] += 0.5 * self._frame.pixels / arguments[2][0] ** 2
         # the scatter is independent of the others: it is known by the shifts' size alone
         size = sources + 1 + len(BACKGROUND_TERMS)
         out = np.zeros((size, size))
         index = [*range(sources), *range(sources + 1, sources + 1 + terms)]
-        out[np.ix_(index, index)] = known_part
+        out[np.ix_(index, index)] = others
         out[sources, sources] = known
         change = self._chain_rule(params)
         return np.asarray(change.T @ out @ change)
@@ -190,20 +170,20 @@ class FrameLikelihood:
             image, or expected counts are negative.
         """
         theta, nuisances, background = self._one(params)
-        scale, *offset, sigma, scatter = (float(value) for value in nuisances)
-        flux = scale * self._flux
+        flux = nuisances.flux_scale * self._flux
         if self._free:
             flux = self._flux * rng.gamma(2.0, 0.5, self._flux.size)
         ny, nx = self.model.detector.shape
         optics, out = self._optics, np.zeros(ny * stride(nx))
-        unfolded = image(optics, theta, *offset, sigma, flux, out)
-        if scatter:
+        at_rest = nuisances._replace(position_scatter=0.0)
+        unfolded = render_sources(optics, theta, at_rest, flux, out)
+        if nuisances.position_scatter:
             # a shift is as imaged: it moves the image, and leaves the distortion that of the
             # catalogue's position
-            by_x, by_y = scatter * rng.standard_normal((2, flux.size))
+            by_x, by_y = nuisances.position_scatter * rng.standard_normal((2, flux.size))
             out[:] = 0.0
             moved = optics._replace(x=optics.x + by_x, y=optics.y + by_y)
-            image(moved, theta, *offset, sigma, flux, out)
+            render_sources(moved, theta, at_rest, flux, out)
         sources = out.reshape(ny, -1)[:, :nx]
         level = self._background(background) - self.noise.shift
         if not (unfolded and np.all((sources + level)[self.mask] >= 0.0)):
@@ -211,13 +191,12 @@ class FrameLikelihood:
         return self.noise.draw(sources, np.maximum(level, -sources), rng)
 
     def _expected(self, params: Floats) -> tuple[Floats, Floats]:
-        arguments = self._one(params)
         ny, nx = self.model.detector.shape
-        with self._rendered(arguments) as (w, drawn):
+        with self._rendered(params) as (w, rendered, parameters):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
-        bad = 0.0 if drawn.extra > -np.inf else np.nan
-        expected = sources + self._background(arguments[2]) - self.noise.shift + bad
-        return expected, drawn.fitted.fluxes + bad
+        bad = 0.0 if rendered.extra > -np.inf else np.nan
+        level = self._background(parameters.background) - self.noise.shift
+        return sources + level + bad, rendered.fluxes + bad
 
     def _background(self, background: Floats) -> Floats:
         """The background polynomial at every pixel."""
@@ -228,7 +207,7 @@ class FrameLikelihood:
                 out += value * u**m * v[:, None] ** n
         return out
 
-    def _arguments(self, vectors: Floats) -> Arguments:
+    def _arguments(self, vectors: Floats) -> Vectors:
         """Distortion coefficients, source nuisances and background coefficients, a row a vector."""
         distortion = self.model.polynomial
         source = np.tile(self._neutral, (len(vectors), 1))
@@ -239,12 +218,12 @@ class FrameLikelihood:
                 values[:, parameter.slot] = vectors[:, k]
         background[:, 0] += self.noise.shift
         theta = distortion.monomial_coefficients(vectors[:, : distortion.n_terms])
-        return np.ascontiguousarray(theta), source, background
+        return Vectors(np.ascontiguousarray(theta), source, background)
 
-    def _one(self, params: Floats) -> Arguments:
+    def _one(self, params: Floats) -> Parameters:
         """The arguments of one parameter vector."""
-        theta, source, background = self._arguments(params[None])
-        return theta[0], source[0], background[0]
+        parameters: Parameters = parameters_of(self._arguments(params[None]), 0)
+        return parameters
 
     @cached_property
     def _neutral(self) -> Floats:
@@ -281,15 +260,16 @@ class FrameLikelihood:
             workspace = self._workspaces.get_nowait()
         except queue.Empty:
             start = np.array([parameter.start for parameter in self.parameters])
-            workspace = new_workspace(self._optics, self._one(start)[1], self._free)
+            workspace = new_workspace(self._optics, self._one(start).nuisances, self._free)
         yield workspace
         self._workspaces.put(workspace)
 
     @contextmanager
-    def _rendered(self, arguments: Arguments) -> Iterator[tuple[Workspace, Drawn]]:
-        """A workspace in which the sources are rendered, for one set of arguments."""
+    def _rendered(self, params: Floats) -> Iterator[tuple[Workspace, Rendered, Parameters]]:
+        """A workspace in which the sources are rendered, for one parameter vector."""
+        parameters = self._one(params)
         with self._workspace() as w:
-            yield w, draw(self._optics, self._frame, w, *arguments, self._flux, self._free)
+            yield w, render(self._problem, w, parameters), parameters
             clear(w)
 
     @cached_property
@@ -314,25 +294,27 @@ class FrameLikelihood:
         return True if self.nuisances.flux == "free" else None  # code for None is not compiled
 
     @cached_property
-    def _frame(self) -> Counts:
+    def _problem(self) -> Problem:
+        return Problem(self._optics, self._frame, self._flux, self._free)
+
+    @cached_property
+    def _frame(self) -> Frame:
         ny, nx = self.model.detector.shape
         values = np.full((ny, stride(nx)), MASKED)
         values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, MASKED)
         used = (values > LIMIT).reshape(-1, SEGMENT)
-        clean = np.where(used, values.reshape(-1, SEGMENT), 0.0)
-        total, squares = clean.sum(axis=1), (clean**2).sum(axis=1)
-        return Counts(
-            values.ravel(), used.sum(axis=1).astype(float), total, squares, float(used.sum()),
-            float(total.sum()), nx, self.noise.kind, self.nuisances.background_order > 0,
+        total = np.where(used, values.reshape(-1, SEGMENT), 0.0).sum(axis=1)
+        noise, varies = self.noise.terms(values), self.nuisances.background_order > 0
+        return Frame(
+            values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
+            float(total.sum()), ny, nx, noise, varies,
+            everywhere=varies or not hasattr(noise, "unreached"),
         )  # fmt: skip
 
     @cached_property
     def _constant(self) -> float:
         """The part of the log-likelihood that depends on the counts alone."""
-        if isinstance(self.noise, BackgroundNoise):
-            return 0.0
-        shifted = np.maximum(self.counts[self.mask] + self.noise.shift, 0.0)
-        return -float(np.sum(gammaln(shifted + 1.0)))
+        return self.noise.constant(self.counts, self.mask)
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

@@ -6,7 +6,7 @@ import numpy.typing as npt
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.noise import Noise
 from bayesfred.model.parameters import Nuisances
 
 
@@ -14,7 +14,7 @@ def usable_pixels(
     model: ForwardModel,
     counts: Floats,
     mask: npt.ArrayLike | None,
-    noise: PoissonNoise | BackgroundNoise,
+    noise: Noise,
     nuisances: Nuisances,
 ) -> Flags:
     """The pixels for the likelihood, after checking that the frame can be explained at all.
@@ -24,7 +24,7 @@ def usable_pixels(
     model : ForwardModel
     counts : ndarray, shape (ny, nx), counts
     mask : array_like of bool, shape (ny, nx), optional
-    noise : PoissonNoise or BackgroundNoise
+    noise : Noise
     nuisances : Nuisances
 
     Returns
@@ -36,13 +36,6 @@ def usable_pixels(
     InputError
         If it cannot.
     """
-    if isinstance(noise, BackgroundNoise) and (
-        nuisances.flux == "free" or nuisances.background_order
-    ):
-        raise InputError(
-            "noise: got BackgroundNoise with free fluxes or a varying background, expected fixed "
-            "or scaled fluxes and background_order 0: use PoissonNoise"
-        )
     shape = model.detector.shape
     used = np.ones(shape, bool) if mask is None else np.array(mask, dtype=bool)
     for name, array in (("counts", counts), ("mask", used)):
@@ -68,11 +61,7 @@ def usable_pixels(
         raise InputError(
             f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them"
         )
-    if isinstance(noise, PoissonNoise) and noise.read_noise == 0 and counts[used].min() < 0:
-        raise InputError(
-            f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: check "
-            "gain and pedestal, give read_noise, or mask these pixels"
-        )
+    noise.check(counts, used, nuisances.flux, nuisances.background_order)
     return used
 
 

@@ -19,7 +19,7 @@ from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
 from bayesfred.model.likelihood import FrameLikelihood
-from bayesfred.model.noise import BackgroundNoise, PoissonNoise
+from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
 from bayesfred.model.pixels import usable_pixels
 from bayesfred.model.protocol import TargetDensity
@@ -38,7 +38,8 @@ class Posterior(TargetDensity):
         By parameter name; the others get the default of the table of parameters. Parameters are
         independent a priori. A distortion that leaves a source without an image, or folds the frame
         (D <= 0) within two of the PSF's widths of one, has probability zero.
-    noise : PoissonNoise or BackgroundNoise
+    noise : Noise
+        `PoissonNoise`, `GaussianNoise`, `BackgroundNoise` or a model of your own.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is to be used.
     nuisances : Nuisances
@@ -72,7 +73,7 @@ class Posterior(TargetDensity):
     model: ForwardModel
     counts: Floats
     prior: Mapping[str, Any]
-    noise: PoissonNoise | BackgroundNoise
+    noise: Noise
     mask: Flags
     nuisances: Nuisances
     extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
@@ -83,7 +84,7 @@ class Posterior(TargetDensity):
         counts: npt.ArrayLike,
         *,
         prior: Mapping[str, Any] | None = None,
-        noise: PoissonNoise | BackgroundNoise = PoissonNoise(),
+        noise: Noise = PoissonNoise(),
         mask: npt.ArrayLike | None = None,
         nuisances: Nuisances = Nuisances(),
         extrapolation: FluxExtrapolation | None = None,

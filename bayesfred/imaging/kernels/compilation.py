@@ -20,7 +20,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.types import BaseNamedTuple, BaseTuple  # type: ignore[attr-defined]
 
 # Folders of the package with compiled code.
-FOLDERS = ("imaging/kernels", "model/kernels")
+FOLDERS = ("imaging/kernels", "imaging/psf", "model/kernels", "model/noise")
 
 
 @cache
@@ -37,7 +37,10 @@ def source_hash() -> str:
 
 @cache
 def _module_hash(module: str) -> str:
-    """SHA-256 of a module's source; of one without a file, as in a notebook, a number that no other process draws."""
+    """SHA-256 of a module's source.
+
+    Without a file, as in a notebook, it is a number that no other process draws.
+    """
     path = getattr(sys.modules.get(module), "__file__", None)
     return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else secrets.token_hex()
 
@@ -71,7 +74,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a function that Python calls, and keep its machine code on disk; the options are those of `numba.njit`."""
+    """Compile a function that Python calls, and keep its machine code on disk.
+
+    The options are those of `numba.njit`.
+    """
     return partial(_compiled, nogil=True, **options)
 
 

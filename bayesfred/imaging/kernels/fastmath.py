@@ -1,4 +1,7 @@
-"""Arithmetic that vectorises: exp2, log and the relaxed rules they are compiled by; and a counter that threads share."""
+"""Arithmetic that vectorises: exp2, log and the rules they are compiled by.
+
+And a counter that threads share.
+"""
 
 from typing import Any
 
@@ -36,7 +39,7 @@ def as_bits(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def take_turn(typingctx: Any, turn: Any) -> Any:
-    """The int64 that an array begins with, raised by one in the same instant: no two threads get the same."""
+    """The int64 that an array begins with, raised by one: no two threads get the same."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data

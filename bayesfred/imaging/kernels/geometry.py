@@ -9,7 +9,7 @@ which makes them well conditioned and gives the window of pixels to visit. So ar
 Jacobian determinant D = a_u b_v - a_v b_u, multiplied out once per source.
 
 `forward.py` binds these modules' functions to the public objects; the loops over counts are in
-`inference/kernels`.
+`model/kernels`.
 """
 
 import math
@@ -17,110 +17,86 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.contexts import (
+    LANES,
+    Footprints,
+    Geometry,
+    Layout,
+    Source,
+    SourceNuisances,
+)
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.polynomials import evaluate, multiply, shift
-from bayesfred.imaging.kernels.psf_profiles import Gaussian, Moffat, Spline
 
-# rows are visited in multiples of this many pixels, which spares the loops their scalar remainders
-LANES = 8
 CORE = 2.0  # widths of the PSF about a source's image within which its map must not fold
-SEGMENT = 16  # pixels that are marked together as reached by a source
+SCATTER = 6.0  # standard deviations by which positions that scatter may move
 
 
-class Optics(NamedTuple):
-    """A forward model as the loops need it; s counts sources, k terms."""
+class _Search(NamedTuple):
+    """What the search for a source's window knows: radii in (a, b), and its memory."""
 
-    psf: Gaussian | Moffat | Spline
-    x: Floats  # (s,) pixel
-    y: Floats
-    f_powers: Ints  # (k, 2) powers of u and v
-    g_powers: Ints
-    f_lever: Floats  # (s, k) x^i y^j
-    g_lever: Floats
-    offsets: Floats  # quadrature nodes of a pixel along one axis, pixel
-    weights: Floats
-    step: float  # pitch of the recorded pixels in fine pixels
-    ny: int
-    nx: int
-    reach: float  # (a, b) that lie farther from 0 are below the tolerance, sigma
-    ramp: Floats  # (padded row,) u of pixels counted from a row's first
-    degree: tuple[int, ...]  # its length is the degree of a and b in u or v, whichever is higher
-    q_degree: tuple[int, ...]  # of a^2 + b^2
-    d_degree: tuple[int, ...]  # of D; empty where flux is not conserved
-
-
-class Maps(NamedTuple):
-    """Where the sources are imaged and which pixels they reach."""
-
-    a: Floats  # (s, degree + 1, degree + 1) coefficients about the peak, powers of u first
-    b: Floats
-    q: Floats  # (s, q_degree + 1, q_degree + 1) of a^2 + b^2, powers of v first
-    d: Floats  # (s, d_degree + 1, d_degree + 1) of D, or 1 where flux is not conserved
-    peak: Floats  # (s, 2) u, v
-    ellipse: Floats  # (s, 4) alpha, beta, gamma, R^2: alpha t^2 + 2 beta t w + gamma w^2 <= R^2
-    rows: Ints  # (s, 2) first row and the one after the last
-
-
-class Footprints(NamedTuple):
-    """The pixels of every source, as rows: of source s those from first[s] to first[s + 1]."""
-
-    first: Ints  # (s + 1,)
-    low: Ints  # (rows,) first pixel
-    size: Ints  # pixels
-    start: Ints  # (rows + 1,) where the row's samples begin, counted over all sources
-    row: Ints  # the frame's row
-
-
-def stride(nx: int) -> int:
-    """Pixels a padded image row takes: an odd number of segments, lest the rows' pixels fall on the same cache lines."""
-    return (-(-(nx + LANES) // SEGMENT) | 1) * SEGMENT
+    radius: float
+    core: float
+    bounds: Floats  # coefficients of rho
+    stack: Floats  # parts of the frame
 
 
 @inner()
-def new_maps(o):
-    """Room for the maps of all sources."""
+def new_geometry(o):
+    """Room for the geometry of all sources."""
     size = o.x.size
-    n, n_q, n_d = len(o.degree) + 1, len(o.q_degree) + 1, len(o.d_degree) + 1
+    n, n_q, n_d = len(o.degrees.ab) + 1, len(o.degrees.q) + 1, len(o.degrees.d) + 1
     a, b = np.empty((size, n, n)), np.empty((size, n, n))
     q, d = np.empty((size, n_q, n_q)), np.empty((size, n_d, n_d))
-    return Maps(a, b, q, d, np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64))
+    peak, ellipse, rows = np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64)
+    return Geometry(a, b, q, d, peak, ellipse, rows)
 
 
 @inner()
 def new_work(o):
     """Room for a row's polynomials."""
-    return np.empty((7, 2 * len(o.degree) + 1))
+    return np.empty((7, 2 * len(o.degrees.ab) + 1))
 
 
 @inner()
-def _fill(o, s, theta, offset_x, offset_y, a, b):
+def one_source(geometry, s):
+    """Source s alone."""
+    u, v = geometry.peak[s, 0], geometry.peak[s, 1]
+    return Source(geometry.a[s], geometry.b[s], geometry.q[s], geometry.d[s], u, v)
+
+
+@inner()
+def _fill(o, s, theta, nuisances, a, b):
     """Coefficients of a and b of source s in powers of u and v, about the frame's middle."""
     a[:] = 0.0
     b[:] = 0.0
-    a[0, 0] = -o.x[s] - offset_x
-    b[0, 0] = -o.y[s] - offset_y
+    a[0, 0] = -o.x[s] - nuisances.offset_x
+    b[0, 0] = -o.y[s] - nuisances.offset_y
     a[1, 0] = 1.0
     b[0, 1] = 1.0
     n_f = o.f_powers.shape[0]
     for k in range(n_f):
-        a[o.f_powers[k, 0], o.f_powers[k, 1]] += theta[k] * o.f_lever[s, k]
+        a[o.f_powers[k, 0], o.f_powers[k, 1]] += theta[k] * o.f_object_powers[s, k]
     for k in range(o.g_powers.shape[0]):
-        b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_lever[s, k]
+        b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_object_powers[s, k]
 
 
 @inner()
-def _find_peak(o, s, theta, offset_x, offset_y, a, b):
-    """Newton's iteration for a = b = 0, leaving a and b expanded about the solution. Returns u, v, found."""
-    u = o.x[s] + offset_x
-    v = o.y[s] + offset_y
+def _find_peak(o, s, theta, nuisances, a, b):
+    """Newton's iteration for a = b = 0, leaving a and b expanded about the solution.
+
+    Returns u, v, found.
+    """
+    u = o.x[s] + nuisances.offset_x
+    v = o.y[s] + nuisances.offset_y
     far = 4.0 * o.step * (o.nx + o.ny)
     found = False
-    _fill(o, s, theta, offset_x, offset_y, a, b)
+    _fill(o, s, theta, nuisances, a, b)
     for _ in range(50):
-        a_0, a_u, a_v = evaluate(a, u, v, o.degree)
-        b_0, b_u, b_v = evaluate(b, u, v, o.degree)
+        a_0, a_u, a_v = evaluate(a, u, v, o.degrees.ab)
+        b_0, b_u, b_v = evaluate(b, u, v, o.degrees.ab)
         det = a_u * b_v - a_v * b_u
         if det == 0.0:
             break
@@ -130,22 +106,23 @@ def _find_peak(o, s, theta, offset_x, offset_y, a, b):
             break
         u += h
         v += k
-        if (
-            abs(h) + abs(k) <= 1e-9
-        ):  # quadratic convergence: the next step would be far below rounding
+        # quadratic convergence: the next step would be far below rounding
+        if abs(h) + abs(k) <= 1e-9:
             found = True
             break
     if not found:
         u = o.x[s]
         v = o.y[s]
-    shift(a, u, v, o.degree)
-    shift(b, u, v, o.degree)
+    shift(a, u, v, o.degrees.ab)
+    shift(b, u, v, o.degrees.ab)
     return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
 
 
 @inner()
-def _reach(o, a, b, u, v, radius, core, bounds, stack):
-    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius, -1 if D <= 0 where it is <= core.
+def _support_radius(o, source, search):
+    """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius.
+
+    It is -1 if D <= 0 anywhere that |(a, b)| <= core.
 
     With d the distance from the peak, (a, b) = J d + r, and |r| <= rho(|d|) = sum over m + n >= 2
     of |c_mn| |d|^(m + n). On the ellipse |J d| = R' one has |d| <= R'/s, s the smaller singular
@@ -154,6 +131,8 @@ def _reach(o, a, b, u, v, radius, core, bounds, stack):
     if that corner is, for s |d| - rho(|d|) is concave. Otherwise the frame is surveyed. A pixel is
     visited if its centre is within the ellipse enlarged by its farthest quadrature node.
     """
+    a, b, u, v = source.a, source.b, source.u, source.v
+    radius, bounds = search.radius, search.bounds
     j11, j12, j21, j22 = a[1, 0], a[0, 1], b[1, 0], b[0, 1]
     half = 0.5 * (j11 * j11 + j12 * j12 + j21 * j21 + j22 * j22)
     det = j11 * j22 - j12 * j21
@@ -169,16 +148,16 @@ def _reach(o, a, b, u, v, radius, core, bounds, stack):
     margin = largest * math.sqrt(2.0) * abs(o.offsets[0])
     farthest = math.hypot(abs(u) + 0.5 * o.nx * o.step, abs(v) + 0.5 * o.ny * o.step)
     if smallest * farthest - _rest(bounds, farthest) > radius:
-        reach = radius
+        largest_d = radius
         for _ in range(60):
-            rest = _rest(bounds, reach / smallest)
-            if radius + rest <= reach * (1.0 + 1e-6):
-                return reach * (1.0 + 1e-6) + margin
-            reach = radius + rest
-            if reach > 4.0 * radius:
+            rest = _rest(bounds, largest_d / smallest)
+            if radius + rest <= largest_d * (1.0 + 1e-6):
+                return largest_d * (1.0 + 1e-6) + margin
+            largest_d = radius + rest
+            if largest_d > 4.0 * radius:
                 break
-    reach = _survey(o, a, b, u, v, radius, core, bounds, stack)
-    return reach + margin if reach >= 0.0 else -1.0
+    largest_d = _survey(o, source, search)
+    return largest_d + margin if largest_d >= 0.0 else -1.0
 
 
 @inner()
@@ -191,128 +170,132 @@ def _rest(bounds, d):
 
 
 @inner()
-def _survey(o, a, b, u, v, radius, core, bounds, stack):
-    """The largest |J d| in the frame where |(a, b)| <= radius, at most; -1 if D <= 0 where |(a, b)| <= core.
+def _survey(o, source, search):
+    """A bound of |J d| in the frame where |(a, b)| <= radius; -1 if D <= 0 where it is <= core.
 
     The frame is halved along both axes and so are its parts, unless they lie beyond the radius: at
     distance r from a part's middle (a, b) differs from its value there by at most |J| r + M r^2 /
     2, M = sum of |c_mn| k (k - 1) |d|^(k - 2), k = m + n. Parts are not halved below a twelfth of
     the radius; there the middle stands for the part.
     """
+    a, b, bounds, stack = source.a, source.b, search.bounds, search.stack
+    radius, core = search.radius, search.core
     across, along = 0.5 * o.nx * o.step, 0.5 * o.ny * o.step
-    stack[0, 0], stack[0, 1], stack[0, 2] = -u, -v, 1.0
-    size, reach = 1, 0.0
+    stack[0, 0], stack[0, 1], stack[0, 2] = -source.u, -source.v, 1.0
+    size, largest = 1, 0.0
     while size > 0:
         size -= 1
         t, w, part = stack[size, 0], stack[size, 1], stack[size, 2]
         half_t, half_w = part * across, part * along
         r = math.hypot(half_t, half_w)
-        a_0, a_u, a_v = evaluate(a, t, w, o.degree)
-        b_0, b_u, b_v = evaluate(b, t, w, o.degree)
+        a_0, a_u, a_v = evaluate(a, t, w, o.degrees.ab)
+        b_0, b_u, b_v = evaluate(b, t, w, o.degrees.ab)
         here = math.hypot(a_0, b_0)
         far = math.hypot(t, w) + r
-        bend = 0.0
+        curvature = 0.0
         for k in range(bounds.size - 1, 1, -1):
-            bend = bend * far + k * (k - 1) * bounds[k]
-        if here > radius + r * (
-            math.sqrt(a_u * a_u + a_v * a_v + b_u * b_u + b_v * b_v) + 0.5 * bend * r
-        ):
+            curvature = curvature * far + k * (k - 1) * bounds[k]
+        slope = math.sqrt(a_u * a_u + a_v * a_v + b_u * b_u + b_v * b_v)
+        if here > radius + r * (slope + 0.5 * curvature * r):
             continue
         if max(half_t, half_w) <= radius / 12.0:
             if here <= core and a_u * b_v - a_v * b_u <= 0.0:
                 return -1.0
             for i in range(4):
                 t_i, w_i = t + (half_t if i % 2 else -half_t), w + (half_w if i < 2 else -half_w)
-                reach = max(
-                    reach, math.hypot(a[1, 0] * t_i + a[0, 1] * w_i, b[1, 0] * t_i + b[0, 1] * w_i)
-                )
+                j_a, j_b = a[1, 0] * t_i + a[0, 1] * w_i, b[1, 0] * t_i + b[0, 1] * w_i
+                largest = max(largest, math.hypot(j_a, j_b))
             continue
         for i in range(4):
             stack[size, 0] = t + (0.5 * half_t if i % 2 else -0.5 * half_t)
             stack[size, 1] = w + (0.5 * half_w if i < 2 else -0.5 * half_w)
             stack[size, 2] = 0.5 * part
             size += 1
-    return reach
+    return largest
 
 
 @inner()
-def locate(o, theta, offset_x, offset_y, sigma, margin, maps):
-    """Fill `maps`; False where a source has no image, or the map folds (D <= 0) within two of the PSF's widths of one.
+def locate(o, theta, nuisances, geometry):
+    """Fill `geometry`; False where the distortion is not admissible.
 
-    Windows hold the pixels above the tolerance, and those above it once a source moves by up to
-    `margin` in (a, b).
+    That is where a source has no image, or the map folds (D <= 0) within two of the PSF's widths of
+    one. Windows hold the pixels above the tolerance, and those above it once a source moves by as
+    much in (a, b) as positions scatter.
     """
     unfolded = True
-    radius = sigma * o.reach + margin
-    bounds, stack = np.empty(2 * len(o.degree) + 1), np.empty((256, 3))
+    sigma = nuisances.psf_sigma
+    search = _Search(
+        sigma * o.support_radius + SCATTER * nuisances.position_scatter,
+        CORE * sigma,
+        np.empty(2 * len(o.degrees.ab) + 1),
+        np.empty((256, 3)),
+    )
+    rows, ellipse = geometry.rows, geometry.ellipse
     for s in range(o.x.size):
-        a = maps.a[s]
-        b = maps.b[s]
-        u, v, ok = _find_peak(o, s, theta, offset_x, offset_y, a, b)
-        reach = _reach(o, a, b, u, v, radius, CORE * sigma, bounds, stack) if ok else math.inf
-        unfolded = unfolded and ok and reach >= 0.0
-        multiply(a, b, len(o.d_degree) > 0, maps.q[s], maps.d[s])
-        maps.peak[s, 0] = u
-        maps.peak[s, 1] = v
-        if 0.0 <= reach < math.inf:
+        a = geometry.a[s]
+        b = geometry.b[s]
+        u, v, ok = _find_peak(o, s, theta, nuisances, a, b)
+        geometry.peak[s, 0] = u
+        geometry.peak[s, 1] = v
+        radius = _support_radius(o, one_source(geometry, s), search) if ok else math.inf
+        unfolded = unfolded and ok and radius >= 0.0
+        multiply(a, b, len(o.degrees.d) > 0, geometry.q[s], geometry.d[s])
+        if 0.0 <= radius < math.inf:
             alpha = a[1, 0] ** 2 + b[1, 0] ** 2
-            maps.ellipse[s, 0] = alpha
-            maps.ellipse[s, 1] = a[1, 0] * a[0, 1] + b[1, 0] * b[0, 1]
-            maps.ellipse[s, 2] = a[0, 1] ** 2 + b[0, 1] ** 2
-            maps.ellipse[s, 3] = reach * reach
-            height = reach * math.sqrt(alpha) / abs(a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0])
+            ellipse[s, 0] = alpha
+            ellipse[s, 1] = a[1, 0] * a[0, 1] + b[1, 0] * b[0, 1]
+            ellipse[s, 2] = a[0, 1] ** 2 + b[0, 1] ** 2
+            ellipse[s, 3] = radius * radius
+            height = radius * math.sqrt(alpha) / abs(a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0])
             centre = 0.5 * (o.ny - 1)
             low = min(max((v - height) / o.step + centre, -1.0), 1.0 * o.ny)
             high = min(max((v + height) / o.step + centre, -1.0), 1.0 * o.ny)
-            maps.rows[s, 0] = max(math.ceil(low), 0)
-            maps.rows[s, 1] = min(math.floor(high), o.ny - 1) + 1
+            rows[s, 0] = max(math.ceil(low), 0)
+            rows[s, 1] = min(math.floor(high), o.ny - 1) + 1
         else:
-            maps.ellipse[s] = 0.0
-            maps.rows[s, 0] = 0
-            maps.rows[s, 1] = o.ny
+            ellipse[s] = 0.0
+            rows[s, 0] = 0
+            rows[s, 1] = o.ny
     return unfolded
 
 
 @inner()
-def move(o, maps, s, by_x, by_y):
+def move(o, geometry, s, by_x, by_y):
     """Shift source s along a and b."""
-    maps.a[s, 0, 0] -= by_x
-    maps.b[s, 0, 0] -= by_y
-    multiply(maps.a[s], maps.b[s], len(o.d_degree) > 0, maps.q[s], maps.d[s])
+    a, b = geometry.a[s], geometry.b[s]
+    a[0, 0] -= by_x
+    b[0, 0] -= by_y
+    multiply(a, b, len(o.degrees.d) > 0, geometry.q[s], geometry.d[s])
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def footprints(o, maps):
+def find_footprints(o, geometry):
     """The rows of pixels that every source reaches, their lengths multiples of LANES."""
-    sources, size = maps.peak.shape[0], 0
+    sources, size = geometry.peak.shape[0], 0
     for s in range(sources):
-        size += max(0, maps.rows[s, 1] - maps.rows[s, 0])
+        size += max(0, geometry.rows[s, 1] - geometry.rows[s, 0])
     first = np.zeros(sources + 1, np.int64)
     low, count, row = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     start = np.zeros(size + 1, np.int64)
     ny, nx, step = o.ny, o.nx, o.step
     i = 0
     for s in range(sources):
-        alpha, beta, gamma, square = (
-            maps.ellipse[s, 0],
-            maps.ellipse[s, 1],
-            maps.ellipse[s, 2],
-            maps.ellipse[s, 3],
-        )
+        ellipse = geometry.ellipse[s]
+        alpha, beta, gamma, square = ellipse[0], ellipse[1], ellipse[2], ellipse[3]
         # In columns, row v_peak + w has its chord's middle at middle + slope w, and half the chord
-        # squared is half - bend w^2.
-        middle, slope, half, bend = 0.0, 0.0, 1.0 * nx * nx, 0.0
+        # squared is half - decrease w^2.
+        middle, slope, half, decrease = 0.0, 0.0, 1.0 * nx * nx, 0.0
         if alpha > 0.0:
-            middle = maps.peak[s, 0] / step + 0.5 * (nx - 1)
+            middle = geometry.peak[s, 0] / step + 0.5 * (nx - 1)
             slope = -beta / (alpha * step)
             half = square / (alpha * step * step)
-            bend = (alpha * gamma - beta * beta) / (alpha * step) ** 2
-        top = maps.peak[s, 1] + 0.5 * (ny - 1) * step
-        for j in range(maps.rows[s, 0], maps.rows[s, 1]):
+            decrease = (alpha * gamma - beta * beta) / (alpha * step) ** 2
+        top = geometry.peak[s, 1] + 0.5 * (ny - 1) * step
+        for j in range(geometry.rows[s, 0], geometry.rows[s, 1]):
             w = j * step - top
-            reach = math.sqrt(max(half - bend * w * w, 0.0))
-            at = math.ceil(min(max(middle + slope * w - reach, 0.0), 1.0 * nx))
-            n = math.floor(min(max(middle + slope * w + reach, -1.0), nx - 1.0)) + 1 - at
+            chord = math.sqrt(max(half - decrease * w * w, 0.0))
+            at = math.ceil(min(max(middle + slope * w - chord, 0.0), 1.0 * nx))
+            n = math.floor(min(max(middle + slope * w + chord, -1.0), nx - 1.0)) + 1 - at
             if n > 0:
                 n = -(-n // LANES) * LANES
                 low[i], count[i], row[i] = at, n, j
@@ -331,9 +314,15 @@ def row_starts(fp, pitch):
     return at
 
 
+@inner()
+def lay_out(o, geometry, sigma):
+    """The sources as they lie on the frame once they are located."""
+    return Layout(o, geometry, find_footprints(o, geometry), sigma, new_work(o))
+
+
 @entry()
 def image_positions(o, theta, offset_x, offset_y, sigma):
-    """Where the sources are imaged, shape (s, 2); a source without an image stays at its place."""
-    maps = new_maps(o)
-    locate(o, theta, offset_x, offset_y, sigma, 0.0, maps)
-    return maps.peak
+    """Where the sources are imaged, shape (s, 2); one without an image stays where it is."""
+    geometry = new_geometry(o)
+    locate(o, theta, SourceNuisances(1.0, offset_x, offset_y, sigma, 0.0), geometry)
+    return geometry.peak

@@ -1,35 +1,72 @@
-"""Derivatives of an image with respect to the coefficients and to what else moves, scales or widens its sources."""
+"""Derivatives of an image: by coefficients, and by what else moves, scales or widens its sources.
+
+An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a g-term
+changes b, hence p by p_b B and D by B_v a_u - B_u a_v. `sums.py` sums such derivatives over a
+source's pixels without making them.
+"""
 
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
-from bayesfred.imaging.kernels.geometry import footprints, locate, new_maps, new_work
+from bayesfred.imaging.kernels.contexts import SourceNuisances
+from bayesfred.imaging.kernels.fastmath import FAST
+from bayesfred.imaging.kernels.geometry import (
+    lay_out,
+    locate,
+    new_geometry,
+    one_source,
+)
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-from bayesfred.imaging.kernels.psf_profiles import psf_bends, psf_slopes
+from bayesfred.imaging.kernels.psf_dispatch import psf_second_derivatives, psf_slopes
 
 
-class Basis(NamedTuple):
-    """What derivatives are made of: the unit-flux kernel's derivative with respect to single monomials of f and g.
+class Line(NamedTuple):
+    """Pixels of a row, at t = u - u_peak = t0 + ramp[i]."""
 
-    d K / d theta_k of a source is lever[s, k] times row[k] of the basis: first the monomials u^m
-    v^n of f, then those of g, then K itself (flux), then dK/dsigma.
-    """
+    ramp: Floats
+    t0: float
 
-    f: Ints  # (., 2) powers of u and v
-    g: Ints
-    row: Ints  # (parameters,)
-    lever: Floats  # (s, parameters)
+
+class Samples(NamedTuple):
+    """What is sampled in a row's pixels, s = sign(D)."""
+
+    p: Floats  # P
+    size: Floats  # P |D|
+    signed: Floats  # s P
+    along_a: Floats  # P_a |D|
+    along_b: Floats  # P_b |D|
+
+
+class Rows(NamedTuple):
+    """Buffers for a row of a basis."""
+
+    out: Floats  # (monomials of f and g + 2, row)
+    samples: Floats  # (9, row)
+    powers: Floats  # (degree + 1, row)
+
+
+@inner()
+def new_rows(o, basis, width):
+    """Room for a row of a basis."""
+    out = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
+    return Rows(out, np.empty((9, width)), np.empty((len(o.degrees.ab) + 1, width)))
+
+
+@inner()
+def widens(basis):
+    """Whether the width is a parameter: it is the last, then."""
+    size = basis.row.size
+    return size > 0 and basis.row[-1] == basis.f.shape[0] + basis.g.shape[0] + 1
 
 
 @nb.njit(inline="always")
-def _polynomial_row(out, ramp, t0, coefficients, degree):
-    """out[i] = a polynomial at t = t0 + ramp[i]."""
-    top = len(degree)
+def _polynomial_row(out, line, coefficients, degree):
+    """out[i] = a polynomial of t."""
+    top, ramp, t0 = len(degree), line.ramp, line.t0
     for i in range(out.size):
         t = t0 + ramp[i]
         p = coefficients[top]
@@ -39,9 +76,9 @@ def _polynomial_row(out, ramp, t0, coefficients, degree):
 
 
 @nb.njit(inline="always")
-def _times_polynomial(out, source, factor, ramp, t0, coefficients, degree):
-    """out[i] = factor times source[i] times a polynomial at t = t0 + ramp[i]."""
-    top = len(degree)
+def _times_polynomial(out, source, factor, line, coefficients, degree):
+    """out[i] = factor times source[i] times a polynomial of t."""
+    top, ramp, t0 = len(degree), line.ramp, line.t0
     for i in range(out.size):
         t = t0 + ramp[i]
         p = coefficients[top]
@@ -51,20 +88,23 @@ def _times_polynomial(out, source, factor, ramp, t0, coefficients, degree):
 
 
 @nb.njit(inline="always")
-def _slopes_row(psf, sigma, weight, p, a, b):
+def _slopes_row(psf, inverse, weight, p, a, b):
     """From a and b to weight times p, p_a and p_b."""
+    slope = -weight * inverse
     for i in range(p.size):
-        k, x, y = psf_slopes(psf, sigma, a[i], b[i])
-        p[i], a[i], b[i] = weight * k, -weight * x, -weight * y
+        k, x, y = psf_slopes(psf, inverse * a[i], inverse * b[i])
+        p[i], a[i], b[i] = weight * k, slope * x, slope * y
 
 
 @nb.njit(inline="always")
-def _bends_row(psf, sigma, weight, along_a, p, a, b):
+def _second_derivatives_row(psf, inverse, weight, along_a, samples):
     """The same for -p_a, or for -p_b, in place of p."""
+    p, a, b = samples.p, samples.along_a, samples.along_b
+    slope, second = weight * inverse, -weight * inverse * inverse
     for i in range(p.size):
-        x, y, xx, xy, yy = psf_bends(psf, sigma, a[i], b[i])
-        p[i] = weight * (x if along_a else y)
-        a[i], b[i] = -weight * (xx if along_a else xy), -weight * (xy if along_a else yy)
+        x, y, xx, xy, yy = psf_second_derivatives(psf, inverse * a[i], inverse * b[i])
+        p[i] = slope * (x if along_a else y)
+        a[i], b[i] = second * (xx if along_a else xy), second * (xy if along_a else yy)
 
 
 @nb.njit(inline="always")
@@ -82,10 +122,37 @@ def _times_absolute(a, b, d):
         b[i] *= abs(d[i])
 
 
+@inner(fastmath=FAST, error_model="numpy")
+def samples_row(layout, weight, template, line, samples):
+    """Sample P = weight p and what comes with it on the row that `layout.work` describes.
+
+    Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is
+    shifted along a and along b, X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or
+    by -p_b.
+    """
+    o, work, inverse = layout.optics, layout.work, 1.0 / layout.sigma
+    degrees, along_a, along_b = o.degrees, samples.along_a, samples.along_b
+    norm = weight * o.psf.norm * inverse * inverse
+    _polynomial_row(along_a, line, work[2], degrees.ab)
+    _polynomial_row(along_b, line, work[3], degrees.ab)
+    if template == 0:
+        _slopes_row(o.psf, inverse, norm, samples.p, along_a, along_b)
+    else:
+        _second_derivatives_row(o.psf, inverse, norm, template == 1, samples)
+    _polynomial_row(samples.signed, line, work[1], degrees.d)
+    _times_absolute(along_a, along_b, samples.signed)
+    _times_determinant(samples.p, samples.size, samples.signed)
+
+
 @nb.njit(inline="always")
-def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, degree):
-    """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma, P being homogeneous of degree -order in a, b and sigma."""
-    top = len(degree)
+def _add_widening(out, order, samples, layout, line):
+    """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma.
+
+    P is homogeneous of degree -order in a, b and sigma.
+    """
+    ra, rb, top, sigma = layout.work[2], layout.work[3], len(layout.optics.degrees.ab), layout.sigma
+    size, along_a, along_b = samples.size, samples.along_a, samples.along_b
+    ramp, t0 = line.ramp, line.t0
     for i in range(out.size):
         t = t0 + ramp[i]
         a, b = ra[top], rb[top]
@@ -93,37 +160,6 @@ def _add_widening(out, size, order, along_a, along_b, sigma, ramp, t0, ra, rb, d
             a = a * t + ra[top - 1 - m]
             b = b * t + rb[top - 1 - m]
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) / sigma
-
-
-@inner(fastmath=FAST, error_model="numpy")
-def _samples_row(
-    psf,
-    sigma,
-    weight,
-    template,
-    ramp,
-    t,
-    ra,
-    rb,
-    rd,
-    degree,
-    d_degree,
-    e,
-    size,
-    signed,
-    along_a,
-    along_b,
-):
-    """P |D|, s P, P_a |D| and P_b |D| of a template at u - u_peak from t on, the names being those of `basis_row`."""
-    _polynomial_row(along_a, ramp, t, ra, degree)
-    _polynomial_row(along_b, ramp, t, rb, degree)
-    if template == 0:
-        _slopes_row(psf, sigma, weight, e, along_a, along_b)
-    else:
-        _bends_row(psf, sigma, weight, template == 1, e, along_a, along_b)
-    _polynomial_row(signed, ramp, t, rd, d_degree)
-    _times_absolute(along_a, along_b, signed)
-    _times_determinant(e, size, signed)
 
 
 @nb.njit(inline="always")
@@ -143,268 +179,94 @@ def _powers_row(powers, ramp, u0, n):
 
 
 @nb.njit(inline="always")
-def _add_monomials(basis_powers, v, n, along, first, second, powers, out, start):
-    """Rows of the basis from `start` on: B along + B_u first + B_v second for the monomials B = u^m v^q of f (or of g)."""
+def _add_monomials(basis_powers, v, terms, powers, out, start):
+    """Add B along + B_u first + B_v second to the rows of the basis from `start` on.
+
+    B are the monomials u^m v^q of f (or of g); the terms are (along, first, second).
+    """
+    along, first, second = terms
     for k in range(basis_powers.shape[0]):
         m = basis_powers[k, 0]
         q = basis_powers[k, 1]
         vq = v**q
         by = q * v ** (q - 1) if q > 0 else 0.0
         row, power = out[start + k], powers[m]
-        for i in range(n):
+        for i in range(along.size):
             row[i] += power[i] * (vq * along[i] + by * second[i])
         if m > 0:
             bx = m * vq
             lower = powers[m - 1]
-            for i in range(n):
+            for i in range(along.size):
                 row[i] += bx * lower[i] * first[i]
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def basis_row(o, maps, basis, s, j, low, n, sigma, template, out, samples, powers, work):
-    """out[:, :n] = the basis of a unit source in n pixels of row j from pixel `low` on.
+def basis_row(layout, basis, s, i, template, rows):
+    """Fill rows.out with the basis of a unit source s in row i of the footprints.
 
-    An f-term changes a by B, hence p by p_a B and D = a_u b_v - a_v b_u by B_u b_v - B_v b_u; a
-    g-term changes b, hence p by p_b B and D by B_v a_u - B_u a_v. With P = weight p and s = sign(D)
-    the rows of `samples` are P, P |D|, s P, P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u.
-
-    Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is
-    shifted along a and along b, X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or
-    by -p_b. The number comes as an np.int64: of a literal one this function would be compiled anew.
+    rows.samples are P, P |D|, s P, P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u. For the
+    templates see `samples_row`. The number comes as an np.int64: of a literal one this function
+    would be compiled again.
     """
-    ra, rb, rav, rbv, rd, slope = work[0], work[1], work[2], work[3], work[4], work[5]
-    ramp, conserve = o.ramp, len(o.d_degree) > 0
+    o, fp, work = layout.optics, layout.footprints, layout.work
+    source, n, top = one_source(layout.geometry, s), fp.size[i], len(o.degrees.ab)
+    ra, rb, rav, rbv, slope = work[2], work[3], work[4], work[5], work[6]
     n_f, n_g = basis.f.shape[0], basis.g.shape[0]
+    out, buffer = rows.out, rows.samples
     for k in range(out.shape[0]):
         out[k, :n] = 0.0
     order = 2.0 if template == 0 else 3.0
-    widens = (
-        basis.row.size > 0 and basis.row[-1] == n_f + n_g + 1
-    )  # the width is the last parameter, if it is one
-    v_row = (j - 0.5 * (o.ny - 1)) * o.step
-    u_row = (low - 0.5 * (o.nx - 1)) * o.step
-    e, size, signed, along_a, along_b = (
-        samples[0, :n],
-        samples[1, :n],
-        samples[2, :n],
-        samples[3, :n],
-        samples[4, :n],
-    )
-    f_u, f_v, g_u, g_v = samples[5, :n], samples[6, :n], samples[7, :n], samples[8, :n]
+    v_row = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step
+    u_row = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step
+    samples = Samples(buffer[0, :n], buffer[1, :n], buffer[2, :n], buffer[3, :n], buffer[4, :n])
+    signed = samples.signed
+    f_u, f_v, g_u, g_v = buffer[5, :n], buffer[6, :n], buffer[7, :n], buffer[8, :n]
     row_k, row_s = out[n_f + n_g, :n], out[n_f + n_g + 1, :n]
-    top = len(o.degree)
     slope[:] = 0.0
     for q in range(o.offsets.size):
         v = v_row + o.offsets[q]
-        map_on_row(maps.a[s], maps.b[s], v - maps.peak[s, 1], ra, rb, rav, rbv, o.degree)
-        polynomial_on_row(maps.d[s], v - maps.peak[s, 1], 1.0, rd, o.d_degree)
+        map_on_row(source, v - source.v, work, o.degrees.ab)
+        polynomial_on_row(source.d, v - source.v, 1.0, work[1], o.degrees.d)
         for p in range(o.offsets.size):
             u = u_row + o.offsets[p]
-            t = u - maps.peak[s, 0]
-            weight = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
-            _samples_row(
-                o.psf,
-                sigma,
-                weight,
-                template,
-                ramp,
-                t,
-                ra,
-                rb,
-                rd,
-                o.degree,
-                o.d_degree,
-                e,
-                size,
-                signed,
-                along_a,
-                along_b,
-            )
-            if conserve:
-                _times_polynomial(f_u, signed, 1.0, ramp, t, rbv, o.degree)
-                _times_polynomial(g_u, signed, -1.0, ramp, t, rav, o.degree)
+            line = Line(o.ramp, u - source.u)
+            samples_row(layout, o.weights[q] * o.weights[p], template, line, samples)
+            if len(o.degrees.d) > 0:
+                _times_polynomial(f_u, signed, 1.0, line, rbv, o.degrees.ab)
+                _times_polynomial(g_u, signed, -1.0, line, rav, o.degrees.ab)
                 for m in range(top):
                     slope[m] = -(m + 1) * rb[m + 1]
-                _times_polynomial(f_v, signed, 1.0, ramp, t, slope, o.degree)
+                _times_polynomial(f_v, signed, 1.0, line, slope, o.degrees.ab)
                 for m in range(top):
                     slope[m] = (m + 1) * ra[m + 1]
-                _times_polynomial(g_v, signed, 1.0, ramp, t, slope, o.degree)
+                _times_polynomial(g_v, signed, 1.0, line, slope, o.degrees.ab)
             else:
-                samples[5:] = 0.0
-            _add_row_of(row_k, size)
-            if widens:
-                _add_widening(
-                    row_s, size, order, along_a, along_b, sigma, ramp, t, ra, rb, o.degree
-                )
-            _powers_row(powers, ramp, u, n)
-            _add_monomials(basis.f, v, n, along_a, f_u, f_v, powers, out, 0)
-            _add_monomials(basis.g, v, n, along_b, g_u, g_v, powers, out, n_f)
-
-
-@inner(fastmath=REDUCE)
-def _weigh_row(weight, size, a, b, e):
-    """Multiply a, b and e by the weight; returns the sum of weight times size."""
-    total = 0.0
-    for i in range(weight.size):
-        total += weight[i] * size[i]
-        a[i] *= weight[i]
-        b[i] *= weight[i]
-        e[i] *= weight[i]
-    return total
-
-
-@inner(fastmath=REDUCE)
-def _two_moments(power, ramp, t0, a, b, e, out):
-    """Sums of a, b and e times power and times power t, at t = t0 + ramp[i], into the columns of out; power becomes power t^2."""
-    a0, a1, b0, b1, e0, e1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(power.size):
-        t, p = t0 + ramp[i], power[i]
-        q = p * t
-        a0 += p * a[i]
-        a1 += q * a[i]
-        b0 += p * b[i]
-        b1 += q * b[i]
-        e0 += p * e[i]
-        e1 += q * e[i]
-        power[i] = q * t
-    out[0, 0], out[0, 1], out[1, 0], out[1, 1], out[2, 0], out[2, 1] = a0, a1, b0, b1, e0, e1
-
-
-@inner()
-def _multiply_out(e, a, b, degree, f_u, f_v, g_u, g_v):
-    """From sums over t^m w^n times E, e[m, n], to those times b_v E, -b_u E, -a_v E and a_u E."""
-    top = len(degree)
-    for m in range(top + 1):
-        for n in range(top + 1):
-            f_u[m, n], f_v[m, n], g_u[m, n], g_v[m, n] = 0.0, 0.0, 0.0, 0.0
-            for i in range(top + 1):
-                for k in range(top):
-                    f_u[m, n] += (k + 1) * b[i, k + 1] * e[m + i, n + k]
-                    f_v[m, n] -= (k + 1) * b[k + 1, i] * e[m + k, n + i]
-                    g_u[m, n] -= (k + 1) * a[i, k + 1] * e[m + i, n + k]
-                    g_v[m, n] += (k + 1) * a[k + 1, i] * e[m + k, n + i]
-
-
-@inner()
-def _shift_sums(sums, h, k, degree):
-    """From sums over t^m w^n to sums over (t + h)^m (w + k)^n, in place."""
-    top = len(degree)
-    for i in range(1, top + 1):
-        for m in range(top, i - 1, -1):
-            for n in range(top + 1):
-                sums[m, n] += h * sums[m - 1, n]
-    for i in range(1, top + 1):
-        for n in range(top, i - 1, -1):
-            for m in range(top + 1):
-                sums[m, n] += k * sums[m, n - 1]
-
-
-@inner()
-def _add_sums(basis_powers, along, first, second, out):
-    """Add to out the sums over B along + B_u first + B_v second for the monomials B = u^m v^n of f (or of g)."""
-    for k in range(basis_powers.shape[0]):
-        m, n = basis_powers[k, 0], basis_powers[k, 1]
-        out[k] += along[m, n]
-        if m > 0:
-            out[k] += m * first[m - 1, n]
-        if n > 0:
-            out[k] += n * second[m, n - 1]
-
-
-@inner(fastmath=FAST, error_model="numpy")
-def add_basis_sums(o, maps, fp, basis, s, sigma, template, weight, out, samples, sums, work):
-    """Add to out[k] the sum over a source's pixels of weight times row k of the basis, see `basis_row`.
-
-    About the source's peak a_u, a_v, b_u and b_v are polynomials in t and w. So the sums follow,
-    however many monomials there are, from those over t^m w^n times A = weight P_a |D|, B = weight
-    P_b |D| and E = weight s P: `sums`, which holds beside them what `_multiply_out` makes of the
-    last.
-    """
-    top, rows = len(o.degree), range(fp.first[s], fp.first[s + 1])
-    n_f, n_g = basis.f.shape[0], basis.g.shape[0]
-    order = 2.0 if template == 0 else 3.0
-    widens = basis.row.size > 0 and basis.row[-1] == n_f + n_g + 1
-    a, b, d, h, k = maps.a[s], maps.b[s], maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
-    ra, rb, rav, rbv, rd, moments = work[0], work[1], work[2], work[3], work[4], work[5:8]
-    begin, ramp, offsets = fp.start[fp.first[s]], o.ramp, o.offsets
-    sums[:] = 0.0
-    flux = 0.0
-    for r in rows:
-        n = fp.size[r]
-        own = weight[fp.start[r] - begin : fp.start[r] - begin + n]
-        e, size, signed = samples[0, :n], samples[1, :n], samples[2, :n]
-        along_a, along_b, power = samples[3, :n], samples[4, :n], samples[5, :n]
-        for q in range(offsets.size):
-            w = (fp.row[r] - 0.5 * (o.ny - 1)) * o.step + offsets[q] - k
-            map_on_row(a, b, w, ra, rb, rav, rbv, o.degree)
-            polynomial_on_row(d, w, 1.0, rd, o.d_degree)
-            for p in range(offsets.size):
-                t = (fp.low[r] - 0.5 * (o.nx - 1)) * o.step + offsets[p] - h
-                norm = o.weights[q] * o.weights[p] * o.psf.norm / (sigma * sigma)
-                _samples_row(
-                    o.psf,
-                    sigma,
-                    norm,
-                    template,
-                    ramp,
-                    t,
-                    ra,
-                    rb,
-                    rd,
-                    o.degree,
-                    o.d_degree,
-                    e,
-                    size,
-                    signed,
-                    along_a,
-                    along_b,
-                )
-                flux += _weigh_row(own, size, along_a, along_b, signed)
-                power[:] = 1.0
-                for m in range(0, 2 * top, 2):
-                    _two_moments(power, ramp, t, along_a, along_b, signed, moments[:, m:])
-                factor = 1.0
-                for i in range(2 * top):
-                    for m in range(2 * top):
-                        sums[0, m, i] += factor * moments[0, m]
-                        sums[1, m, i] += factor * moments[1, m]
-                        sums[2, m, i] += factor * moments[2, m]
-                    factor *= w
-    out[n_f + n_g] += flux
-    if widens:
-        wide = order * flux
-        for m in range(top + 1):
-            for i in range(top + 1):
-                wide += a[m, i] * sums[0, m, i] + b[m, i] * sums[1, m, i]
-        out[n_f + n_g + 1] -= wide / sigma
-    if len(o.d_degree) > 0:
-        _multiply_out(sums[2], a, b, o.degree, sums[3], sums[4], sums[5], sums[6])
-    for i in range(7):
-        _shift_sums(sums[i], h, k, o.degree)
-    _add_sums(basis.f, sums[0], sums[3], sums[4], out[:n_f])
-    _add_sums(basis.g, sums[1], sums[5], sums[6], out[n_f : n_f + n_g])
+                buffer[5:] = 0.0
+            _add_row_of(row_k, samples.size)
+            if widens(basis):
+                _add_widening(row_s, order, samples, layout, line)
+            _powers_row(rows.powers, o.ramp, u, n)
+            _add_monomials(basis.f, v, (samples.along_a, f_u, f_v), rows.powers, out, 0)
+            _add_monomials(basis.g, v, (samples.along_b, g_u, g_v), rows.powers, out, n_f)
 
 
 @inner(fastmath=FAST)
-def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
+def add_jacobian_rows(layout, basis, flux, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
-    work = new_work(o)
-    width = out.shape[2]
-    rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
-    samples = np.empty((9, width))
-    powers = np.empty((len(o.degree) + 1, width))
-    for s in range(o.x.size):
-        if maps.rows[s, 0] >= last or maps.rows[s, 1] <= first:
+    fp, rows = layout.footprints, new_rows(layout.optics, basis, out.shape[2])
+    reached = layout.geometry.rows
+    for s in range(flux.size):
+        if reached[s, 0] >= last or reached[s, 1] <= first:
             continue
         for p in range(fp.first[s], fp.first[s + 1]):
             j, low, n = fp.row[p], fp.low[p], fp.size[p]
             if not first <= j < last:
                 continue
-            basis_row(o, maps, basis, s, j, low, n, sigma, np.int64(0), rows, samples, powers, work)
+            basis_row(layout, basis, s, p, np.int64(0), rows)
             for k in range(basis.row.size):
-                c = flux[s] * basis.lever[s, k]
+                c = flux[s] * basis.factors[s, k]
                 if c != 0.0:
-                    source = rows[basis.row[k]]
+                    source = rows.out[basis.row[k]]
                     target = out[k, j - first, low : low + n]
                     for i in range(n):
                         target[i] += c * source[i]
@@ -413,6 +275,6 @@ def add_jacobian_rows(o, maps, fp, basis, flux, sigma, first, last, out):
 @entry()
 def jacobian(o, theta, sigma, flux, basis, out):
     """d image / d parameters into out (parameters, ny, padded row)."""
-    maps = new_maps(o)
-    locate(o, theta, 0.0, 0.0, sigma, 0.0, maps)
-    add_jacobian_rows(o, maps, footprints(o, maps), basis, flux, sigma, 0, o.ny, out)
+    geometry = new_geometry(o)
+    locate(o, theta, SourceNuisances(1.0, 0.0, 0.0, sigma, 0.0), geometry)
+    add_jacobian_rows(lay_out(o, geometry, sigma), basis, flux, 0, o.ny, out)

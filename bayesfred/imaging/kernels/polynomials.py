@@ -1,4 +1,4 @@
-"""Polynomials in two variables as matrices of coefficients: evaluated, shifted, multiplied out, cut along a row of pixels.
+"""Polynomials in two variables as matrices of coefficients.
 
 On a row of pixels they are polynomials in u alone. Their degree reaches the innermost loop as the
 length of a tuple, that is as a compile-time constant, so that the loop over pixels vectorises for
@@ -57,8 +57,10 @@ def multiply(a, b, conserve, q, d):
 
 
 @inner(fastmath=FAST)
-def map_on_row(a, b, w, ra, rb, rav, rbv, degree):
-    """Coefficients in t = u - u_peak of a, b, a_v and b_v on the row at v = v_peak + w."""
+def map_on_row(source, w, work, degree):
+    """Fill work[2:6] with a, b, a_v and b_v in powers of t = u - u_peak at v = v_peak + w."""
+    a, b = source.a, source.b
+    ra, rb, rav, rbv = work[2], work[3], work[4], work[5]
     for m in range(len(degree) + 1):
         pa, pb, pav, pbv = 0.0, 0.0, 0.0, 0.0
         for k in range(a.shape[1]):

@@ -5,82 +5,78 @@ two Horner sweeps and one exponential.
 """
 
 from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.contexts import Canvas, Geometry
 from bayesfred.imaging.kernels.fastmath import FAST
-from bayesfred.imaging.kernels.geometry import (
-    Maps,
-    footprints,
-    locate,
-    new_maps,
-    new_work,
-    row_starts,
-)
+from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, one_source, row_starts
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-from bayesfred.imaging.kernels.psf_profiles import psf_arguments, psf_slopes, psf_value
+from bayesfred.imaging.kernels.psf_dispatch import fill_psf_row, psf_on_row, psf_slopes
 
-BATCH = (
-    32  # sources whose rows are listed at a time: of many sources the list would outgrow the caches
-)
+# sources whose rows are listed at a time: of many sources the list would outgrow the caches
+BATCH = 32
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def add_source(o, maps, fp, s, first, last, sigma, flux, at, out, work, place, stamps):
-    """Add the rows of source s from `first` to `last` to `out`, the samples of row i from at[i] on.
+def add_source(layout, s, rows, flux, canvas, alone):
+    """Add the rows of source s from rows[0] to rows[1], times its flux, to a canvas.
 
-    With `stamps` the source alone is left there, row i from place[i] on.
+    `alone` is None or a canvas where the source alone is left.
     """
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this
     # function: a call costs more than a short row.
-    d, u, v = maps.d[s], maps.peak[s, 0], maps.peak[s, 1]
-    offsets, weights, step, lows, rows, sizes = (
-        o.offsets,
-        o.weights,
-        o.step,
-        fp.low,
-        fp.row,
-        fp.size,
-    )
+    o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
+    source = one_source(layout.geometry, s)
+    d, u, v = source.d, source.u, source.v
+    offsets, weights, step = o.offsets, o.weights, o.step
+    lows, js, sizes = fp.low, fp.row, fp.size
+    out, at = canvas.image, canvas.at
     middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
-    r, rd, r2, ramp, psf = work[0], work[1], work[2], o.ramp, o.psf
-    d_top = len(o.d_degree)
+    r, rd, ra, rb, ramp, psf = work[0], work[1], work[2], work[3], o.ramp, o.psf
+    degrees = o.degrees
+    d_top = len(degrees.d)
     norm = flux * psf.norm / (sigma * sigma)
-    for i in range(first, last):
-        w = (rows[i] - middle_v) * step - v
+    for i in range(rows[0], rows[1]):
+        w = (js[i] - middle_v) * step - v
         t_low = (lows[i] - middle_u) * step - u
         row = out[at[i] : at[i] + sizes[i]]
-        stamp = None if stamps is None else stamps[place[i] : place[i] + sizes[i]]
+        stamp = None if alone is None else alone.image[alone.at[i] : alone.at[i] + sizes[i]]
         for y in range(offsets.size):
-            psf_arguments(psf, maps, s, w + offsets[y], sigma, work, o.degree, o.q_degree)
+            fill_psf_row(psf, source, w + offsets[y], sigma, work, degrees)
             for x in range(offsets.size):
-                polynomial_on_row(d, w + offsets[y], norm * weights[y] * weights[x], rd, o.d_degree)
+                polynomial_on_row(d, w + offsets[y], norm * weights[y] * weights[x], rd, degrees.d)
                 t0 = t_low + offsets[x]
                 for n in range(row.size):
                     t = t0 + ramp[n]
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
-                    value = psf_value(psf, t, r, r2, o.degree, o.q_degree) * abs(j)
+                    value = psf_on_row(psf, t, r, ra, rb, degrees) * abs(j)
                     row[n] += value
-                    if stamps is not None:
+                    if alone is not None:
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
-    """Like `add_source` at unit flux, and F X and F Y beside it: X = -p_a |D| is K's derivative as s moves along a."""
-    u, v = maps.peak[s, 0], maps.peak[s, 1]
+def add_templates(layout, s, flux, stamps):
+    """Add K, F X and F Y of source s to its rows of `stamps`, shape (3, samples).
+
+    X = -p_a |D| is K's derivative as the source moves along a, Y along b.
+    """
+    o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
+    source = one_source(layout.geometry, s)
     offsets, weights, step, ramp = o.offsets, o.weights, o.step, o.ramp
-    rd, ra, rb, rav, rbv = work[1], work[2], work[3], work[4], work[5]
-    d_top, top = len(o.d_degree), len(o.degree)
+    rd, ra, rb = work[1], work[2], work[3]
+    degrees = o.degrees
+    d_top, top, inverse = len(degrees.d), len(degrees.ab), 1.0 / sigma
     for i in range(fp.first[s], fp.first[s + 1]):
-        w = (fp.row[i] - 0.5 * (o.ny - 1)) * step - v
-        t_low = (fp.low[i] - 0.5 * (o.nx - 1)) * step - u
+        w = (fp.row[i] - 0.5 * (o.ny - 1)) * step - source.v
+        t_low = (fp.low[i] - 0.5 * (o.nx - 1)) * step - source.u
         first, last = fp.start[i], fp.start[i + 1]
-        row, row_a, row_b = image[first:last], along[first:last], across[first:last]
+        row, row_a, row_b = stamps[0, first:last], stamps[1, first:last], stamps[2, first:last]
         for y in range(offsets.size):
-            map_on_row(maps.a[s], maps.b[s], w + offsets[y], ra, rb, rav, rbv, o.degree)
+            map_on_row(source, w + offsets[y], work, degrees.ab)
             for x in range(offsets.size):
                 weight = weights[y] * weights[x] * o.psf.norm / (sigma * sigma)
-                polynomial_on_row(maps.d[s], w + offsets[y], weight, rd, o.d_degree)
+                polynomial_on_row(source.d, w + offsets[y], weight, rd, degrees.d)
                 t0 = t_low + offsets[x]
                 for n in range(row.size):
                     t = t0 + ramp[n]
@@ -91,38 +87,24 @@ def add_templates(o, maps, fp, s, sigma, flux, image, along, across, work):
                     for m in range(top):
                         a = a * t + ra[top - 1 - m]
                         b = b * t + rb[top - 1 - m]
-                    k, k_a, k_b = psf_slopes(o.psf, sigma, a, b)
+                    k, k_a, k_b = psf_slopes(o.psf, inverse * a, inverse * b)
                     row[n] += k * abs(j)
-                    row_a[n] += flux * k_a * abs(j)
-                    row_b[n] += flux * k_b * abs(j)
+                    row_a[n] += flux * inverse * k_a * abs(j)
+                    row_b[n] += flux * inverse * k_b * abs(j)
 
 
 @entry()
-def image(o, theta, offset_x, offset_y, sigma, flux, out):
-    """Add all sources to the padded, flattened image `out`. Returns False where a source's map folds."""
-    maps = new_maps(o)
-    work = new_work(o)
-    unfolded = locate(o, theta, offset_x, offset_y, sigma, 0.0, maps)
+def render(o, theta, nuisances, flux, out):
+    """Add all sources to the padded, flattened image `out`; False where a source's map folds."""
+    geometry = new_geometry(o)
+    unfolded = locate(o, theta, nuisances, geometry)
     for s in range(0, flux.size, BATCH):
         e = s + BATCH
-        a, b, q, d = maps.a[s:e], maps.b[s:e], maps.q[s:e], maps.d[s:e]
-        part = Maps(a, b, q, d, maps.peak[s:e], maps.ellipse[s:e], maps.rows[s:e])
-        fp = footprints(o, part)
-        at = row_starts(fp, out.size // o.ny)
-        for i in range(part.peak.shape[0]):
-            add_source(
-                o,
-                part,
-                fp,
-                i,
-                fp.first[i],
-                fp.first[i + 1],
-                sigma,
-                flux[s + i],
-                at,
-                out,
-                work,
-                None,
-                None,
-            )
+        a, b, q, d = geometry.a[s:e], geometry.b[s:e], geometry.q[s:e], geometry.d[s:e]
+        peak, ellipse, rows = geometry.peak[s:e], geometry.ellipse[s:e], geometry.rows[s:e]
+        layout = lay_out(o, Geometry(a, b, q, d, peak, ellipse, rows), nuisances.psf_sigma)
+        fp = layout.footprints
+        canvas = Canvas(out, row_starts(fp, out.size // o.ny))
+        for i in range(peak.shape[0]):
+            add_source(layout, i, (fp.first[i], fp.first[i + 1]), flux[s + i], canvas, None)
     return unfolded

@@ -5,28 +5,12 @@ done cluster by cluster.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred._typing import Ints
 from bayesfred.imaging.kernels.compilation import inner
 from bayesfred.imaging.kernels.fastmath import REDUCE
-
-
-class Clusters(NamedTuple):
-    """Groups of sources whose footprints share pixels: group c holds members[first[c]:first[c + 1]], from top to bottom.
-
-    A group's symmetric matrices, a row for each template of each member, are stored row after row
-    from the first member that shares pixels with the row's own up to the diagonal. What is left out
-    stays zero in Cholesky's factor.
-    """
-
-    members: Ints
-    first: Ints
-    lead: Ints  # column at which a row's storage begins, counted within the group
-    start: Ints  # where a row's column 0 would be in the group's storage
-    begin: Ints  # where the group's storage begins in a flat array
+from bayesfred.model.kernels.contexts import Clusters, Group
 
 
 @inner()
@@ -46,16 +30,15 @@ def bounding_boxes(fp):
 
 @inner()
 def _group(keys, size):
-    """Indices in the order of their keys, which are less than size, and where each key's begin among them."""
+    """Indices in the order of their keys < size, and where each key's begin among them."""
     first = np.zeros(size + 2, np.int64)
     for i in range(keys.size):
         first[keys[i] + 2] += 1
     for k in range(size):
         first[k + 1] += first[k]
     order = np.empty(keys.size, np.int64)
-    for i in range(
-        keys.size
-    ):  # after which first[k + 1] has moved from the beginning of key k to its end
+    # after which first[k + 1] has moved from the beginning of key k to its end
+    for i in range(keys.size):
         order[first[keys[i] + 1]] = i
         first[keys[i] + 1] += 1
     return order, first[:-1]
@@ -65,7 +48,7 @@ def _group(keys, size):
 def find_clusters(boxes, ny, templates):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
-    parent, reach = np.arange(size), np.arange(size)
+    parent, earliest = np.arange(size), np.arange(size)
     order = _group(boxes[:, 0], ny)[0]
     for i in range(size):
         s = order[i]
@@ -74,7 +57,7 @@ def find_clusters(boxes, ny, templates):
             if boxes[t, 0] >= boxes[s, 1]:
                 break
             if boxes[t, 2] < boxes[s, 3] and boxes[s, 2] < boxes[t, 3]:
-                reach[k] = min(reach[k], i)
+                earliest[k] = min(earliest[k], i)
                 p, q = s, t
                 while parent[p] != p:
                     parent[p] = parent[parent[p]]
@@ -99,15 +82,12 @@ def find_clusters(boxes, ny, templates):
     for c in range(groups):
         for i in range(first[c], first[c + 1]):
             within[place[i]] = i - first[c]
-    lead, start, begin = (
-        np.empty(size * templates, np.int64),
-        np.empty(size * templates, np.int64),
-        np.zeros(groups + 1, np.int64),
-    )
+    lead, start = np.empty(size * templates, np.int64), np.empty(size * templates, np.int64)
+    begin = np.zeros(groups + 1, np.int64)
     for c in range(groups):
         total = 0
         for i in range(first[c], first[c + 1]):
-            column = within[reach[place[i]]] * templates
+            column = within[earliest[place[i]]] * templates
             for t in range(templates):
                 row = i * templates + t
                 lead[row] = column
@@ -119,10 +99,10 @@ def find_clusters(boxes, ny, templates):
 
 @inner()
 def one_cluster(clusters, c, templates):
-    """A group's members, and lead and start of its rows."""
+    """Group c."""
     a, b = clusters.first[c], clusters.first[c + 1]
     rows = slice(a * templates, b * templates)
-    return clusters.members[a:b], clusters.lead[rows], clusters.start[rows]
+    return Group(clusters.members[a:b], clusters.lead[rows], clusters.start[rows])
 
 
 @inner()
@@ -139,7 +119,10 @@ def touch(boxes, s, t):
 
 @inner()
 def run_end(fp, s, i, at):
-    """The first of a source's rows after row i that does not follow the one before it both in its template and in an image."""
+    """The first of a source's rows after row i that does not continue the one before it.
+
+    It continues it if it follows it both in its template and in an image.
+    """
     last = fp.first[s + 1]
     i += 1
     while i < last and at[i] == at[i - 1] + fp.size[i - 1]:
@@ -157,17 +140,38 @@ def dot(a, b, weight):
 
 
 @inner()
-def gram(fp, boxes, members, lead, start, stamps, weight, at, out):
-    """out[i, k] = sum over pixels of weight T_i T_k, the lower triangle; a source's templates follow each other.
+def _add_overlap(touching, s, t, weight, at, block):
+    """block[m, n] += sum over the pixels that sources s and t share of weight T_sm T_tn."""
+    fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
+    for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+        p = fp.first[s] + j - boxes[s, 0]
+        q = fp.first[t] + j - boxes[t, 0]
+        a = max(fp.low[p], fp.low[q])
+        b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+        if a < b:
+            ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+            part = weight[at[p] - fp.low[p] + a : at[p] - fp.low[p] + b]
+            for m in range(stamps.shape[0]):
+                left = stamps[m, ps + a : ps + b]
+                for n in range(stamps.shape[0]):
+                    block[m, n] += dot(left, stamps[n, qs + a : qs + b], part)
 
-    Row r of the footprints has its weights from weight[at[r]] on.
+
+@inner()
+def gram(touching, group, weight, at, out):
+    """out[i, k] = sum over pixels of weight T_i T_k, the lower triangle.
+
+    A source's templates follow each other. Row r of the footprints has its weights from
+    weight[at[r]] on.
     """
+    fp, stamps, members, start = touching.footprints, touching.stamps, group.members, group.start
     size = stamps.shape[0]
+    block = np.empty((size, size))
     for i in range(members.size):
         s = members[i]
         for m in range(size):
             row = i * size + m
-            out[start[row] + lead[row] : start[row] + row + 1] = 0.0
+            out[start[row] + group.lead[row] : start[row] + row + 1] = 0.0
         p = fp.first[s]
         while p < fp.first[s + 1]:
             end = run_end(fp, s, p, at)
@@ -179,33 +183,35 @@ def gram(fp, boxes, members, lead, start, stamps, weight, at, out):
                         stamps[m, first:last], stamps[n, first:last], part
                     )
             p = end
-        for k in range(lead[i * size] // size, i):
-            t = members[k]
-            if not touch(boxes, s, t):
-                continue
-            for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-                p = fp.first[s] + j - boxes[s, 0]
-                q = fp.first[t] + j - boxes[t, 0]
-                a = max(fp.low[p], fp.low[q])
-                b = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
-                if a < b:
-                    ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
-                    part = weight[at[p] - fp.low[p] + a : at[p] - fp.low[p] + b]
-                    for m in range(size):
-                        left, row = stamps[m, ps + a : ps + b], start[i * size + m] + k * size
-                        for n in range(size):
-                            out[row + n] += dot(left, stamps[n, qs + a : qs + b], part)
+        for k in range(group.lead[i * size] // size, i):
+            if touch(touching.boxes, s, members[k]):
+                block[:] = 0.0
+                _add_overlap(touching, s, members[k], weight, at, block)
+                for m in range(size):
+                    row = start[i * size + m] + k * size
+                    out[row : row + size] = block[m]
 
 
 @inner()
-def add_block(i, start, out, first_second, first_third, second, second_third, third):
-    """Add to a source's own block of a matrix what its shifts are concerned with."""
+def add_prior(h, group, size, fluxes, scatter):
+    """Add the priors' curvature to H: 1/F^2 for a flux, 1/tau^2 for a shift."""
+    for i in range(group.lead.size):
+        flux = fluxes[group.members[i // size]]
+        h[group.start[i] + i] += 1.0 / flux**2 if i % size == 0 else 1.0 / scatter**2
+
+
+@inner()
+def add_block(i, start, out, block):
+    """Add second derivatives to a source's own block of a matrix.
+
+    The block is (F dx, F dy, dx dx, dx dy, dy dy).
+    """
     row, column = start[3 * i + 1 : 3 * i + 3], 3 * i
-    out[row[0] + column] += first_second
-    out[row[1] + column] += first_third
-    out[row[0] + column + 1] += second
-    out[row[1] + column + 1] += second_third
-    out[row[1] + column + 2] += third
+    out[row[0] + column] += block[0]
+    out[row[1] + column] += block[1]
+    out[row[0] + column + 1] += block[2]
+    out[row[1] + column + 1] += block[3]
+    out[row[1] + column + 2] += block[4]
 
 
 @inner(fastmath=REDUCE)
@@ -217,8 +223,9 @@ def _inner(a, b):
 
 
 @inner()
-def cholesky(h, lead, start):
+def cholesky(h, group):
     """Lower triangle in place; False where the matrix is not positive definite."""
+    lead, start = group.lead, group.start
     for i in range(lead.size):
         at = start[i]
         for k in range(lead[i], i + 1):
@@ -234,8 +241,9 @@ def cholesky(h, lead, start):
 
 
 @inner()
-def solve(lower, lead, start, x):
+def solve(lower, group, x):
     """x <- (L L^T)^-1 x, in place."""
+    lead, start = group.lead, group.start
     for i in range(x.size):
         at = start[i]
         x[i] = (x[i] - _inner(lower[at + lead[i] : at + i], x[lead[i] : i])) / lower[at + i]
@@ -247,9 +255,9 @@ def solve(lower, lead, start, x):
 
 
 @inner()
-def draw_template(fp, s, template, amplitude, at, out):
-    """Add amplitude times one of a source's templates, shape (samples,), to an image."""
-    i = fp.first[s]
+def add_template(fp, s, template, amplitude, canvas):
+    """Add amplitude times one of a source's templates, shape (samples,), to a canvas."""
+    at, out, i = canvas.at, canvas.image, fp.first[s]
     while i < fp.first[s + 1]:
         end = run_end(fp, s, i, at)
         stamp = template[fp.start[i] : fp.start[end]]
@@ -268,5 +276,18 @@ def project(fp, s, template, image, at):
         end = run_end(fp, s, i, at)
         stamp = template[fp.start[i] : fp.start[end]]
         total += _inner(stamp, image[at[i] : at[i] + stamp.size])
+        i = end
+    return total
+
+
+@inner()
+def squared(fp, s, template, weight, at):
+    """Sum over a source's pixels of one of its templates squared times a weight."""
+    total = 0.0
+    i = fp.first[s]
+    while i < fp.first[s + 1]:
+        end = run_end(fp, s, i, at)
+        stamp = template[fp.start[i] : fp.start[end]]
+        total += dot(stamp, stamp, weight[at[i] : at[i] + stamp.size])
         i = end
     return total

@@ -1,135 +1,182 @@
 """Fisher information from the Jacobian, what is free of every source profiled out."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.geometry import SEGMENT, row_starts
+from bayesfred.imaging.kernels.contexts import SEGMENT, Layout
+from bayesfred.imaging.kernels.geometry import new_work, row_starts
 from bayesfred.imaging.kernels.jacobian import add_jacobian_rows
-from bayesfred.model.kernels.clusters import cholesky, dot, gram, one_cluster, solve
+from bayesfred.model.kernels.clusters import add_prior, cholesky, dot, gram, one_cluster, solve
+from bayesfred.model.kernels.contexts import LIMIT
 from bayesfred.model.kernels.likelihood import (
-    LIMIT,
-    POISSON,
+    U,
     background_row,
     log_likelihood,
     next_run,
+    unreached_pixels,
+)
+from bayesfred.model.kernels.noise_dispatch import (
+    at_level,
+    information,
+    level_derivatives,
+    unreached,
 )
 
 BAND = 16  # rows of the Jacobian held at a time
 
 
+class _Band(NamedTuple):
+    """Rows of the Jacobian."""
+
+    jacobian: Floats  # (parameters, rows, padded row)
+    top: int
+    last: int
+
+
 @inner()
-def _fisher_weight(counts, w, background):
-    """Expected information 1 / variance per marked pixel into w.weight, zero where masked; returns the unmarked pixels."""
-    ny = w.span.shape[0]
-    per_row = w.flags.size // ny
-    pixels = counts.pixels
-    for j in range(ny):
-        c0, c1, c2 = background_row(background, j, ny)
-        start, stop = next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+def _fill_weight(frame, noise, w, background):
+    """Expected information per marked pixel into w.weight, zero where masked."""
+    pitch = frame.values.size // frame.ny
+    for j in range(frame.ny):
+        c0, c1, c2 = background_row(background, j, frame.ny)
+        start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
-            for p in range((j * per_row + start) * SEGMENT, (j * per_row + stop) * SEGMENT):
-                u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
                 mu = w.image[p] + c0 + u * (c1 + u * c2)
-                counted = counts.values[p] > LIMIT
-                w.weight[p] = (
-                    (1.0 / (max(mu, 1e-300) if counts.kind == POISSON else c0)) if counted else 0.0
-                )
-            for k in range(j * per_row + start, j * per_row + stop):
-                pixels -= counts.segment_pixels[k]
-            start, stop = next_run(w.flags, w.span, per_row, j, stop)
-    return pixels
+                counted = frame.values[p] > LIMIT
+                w.weight[p] = information(noise, mu, U(p)) if counted else 0.0
+            start, stop = next_run(w, j, stop)
+
+
+@inner()
+def _fill_background(frame, band, sources):
+    """Derivatives with respect to the background's coefficients."""
+    out, terms = band.jacobian, band.jacobian.shape[0] - sources
+    for j in range(band.top, band.last):
+        v, i = (2 * j - frame.ny + 1) / frame.ny, j - band.top
+        for k in range(out.shape[2]):
+            u = (2 * k - frame.nx + 1) / frame.nx
+            out[sources, i, k] = 1.0
+            if terms > 1:
+                out[sources + 1, i, k], out[sources + 2, i, k] = u, v
+            if terms > 3:
+                out[sources + 3, i, k], out[sources + 4, i, k] = u * u, u * v
+                out[sources + 5, i, k] = v * v
+
+
+@inner()
+def _add_products(w, band, out):
+    """Add the band's J W J^T to the lower triangle."""
+    pitch = band.jacobian.shape[2]
+    for j in range(band.top, band.last):
+        start, stop = next_run(w, j, w.span[j, 0])
+        while start >= 0:
+            a, b = start * SEGMENT, stop * SEGMENT
+            weight = w.weight[j * pitch + a : j * pitch + b]
+            for k in range(out.shape[0]):
+                left = band.jacobian[k, j - band.top, a:b]
+                for m in range(k + 1):
+                    out[k, m] += dot(left, band.jacobian[m, j - band.top, a:b], weight)
+            start, stop = next_run(w, j, stop)
+
+
+@inner()
+def _add_cross(w, band, profiled, cross):
+    """Add the band's products of the sources' templates and J to C^T."""
+    if profiled is not None:
+        touching, pitch = profiled.touching, band.jacobian.shape[2]
+        fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
+        templates = stamps.shape[0]
+        for s in range(boxes.shape[0]):
+            for j in range(max(band.top, boxes[s, 0]), min(band.last, boxes[s, 1])):
+                i = fp.first[s] + j - boxes[s, 0]
+                a, b = fp.low[i], fp.low[i] + fp.size[i]
+                weight = w.weight[j * pitch + a : j * pitch + b]
+                for t in range(templates):
+                    stamp = stamps[t, fp.start[i] : fp.start[i + 1]]
+                    for k in range(cross.shape[1]):
+                        row = band.jacobian[k, j - band.top, a:b]
+                        cross[s * templates + t, k] += dot(row, stamp, weight)
+
+
+@inner()
+def _known_scatter(h, group, templates, scatter):
+    """Information about position_scatter from a cluster's sources."""
+    known, column = 0.0, np.empty(group.lead.size)
+    for i in range(column.size):
+        if i % templates > 0:
+            column[:] = 0.0
+            column[i] = 1.0
+            solve(h, group, column)
+            known += 2.0 * (scatter**2 - column[i]) ** 2 / scatter**6
+    return known
+
+
+@inner()
+def _subtract_profiled(w, rendered, profiled, scatter, cross, out):
+    """Subtract C H^-1 C^T from the lower triangle; returns the information about the scatter."""
+    known = 0.0
+    if profiled is not None:
+        touching = profiled.touching
+        fp, clusters, templates = touching.footprints, touching.clusters, touching.stamps.shape[0]
+        at = row_starts(fp, w.image.size // w.span.shape[0])
+        for c in range(clusters.first.size - 1):
+            group = one_cluster(clusters, c, templates)
+            members, column = group.members, np.empty(group.lead.size)
+            h = profiled.factors[clusters.begin[c] : clusters.begin[c + 1]]
+            gram(touching, group, w.weight, at, h)
+            add_prior(h, group, templates, rendered.fluxes, scatter)
+            cholesky(h, group)  # positive definite: the prior's curvature is
+            known += _known_scatter(h, group, templates, scatter)
+            for m in range(out.shape[0]):
+                for i in range(column.size):
+                    column[i] = cross[members[i // templates] * templates + i % templates, m]
+                solve(h, group, column)
+                for k in range(m, out.shape[0]):
+                    for i in range(column.size):
+                        row = members[i // templates] * templates + i % templates
+                        out[k, m] -= cross[row, k] * column[i]
+    return known
 
 
 @entry()
-def fisher(o, counts, w, drawn, nuisances, background, terms, free, basis, out):
-    """Fisher information of source parameters, then the first `terms` background coefficients, fluxes profiled out.
+def fisher(problem, w, rendered, parameters, basis, out):
+    """Fisher information of source parameters, then of as many background coefficients as fit.
 
-    I = sum over pixels of J J^T / mu, band by band of rows; with free fluxes the Schur complement
-    I - C H^-1 C^T over the sources' templates, where H carries the priors' curvature.
+    I = sum over pixels of J J^T / variance, band by band of rows; with free fluxes the Schur
+    complement I - C H^-1 C^T over the sources' templates, where H carries the priors' curvature.
 
     Returns the information about position_scatter: a coordinate measured with variance s^2 scatters
     by tau^2 + s^2 about the catalogue's, which gives 2 tau^2 / (tau^2 + s^2)^2 = 2 (tau^2 - Q)^2 /
     tau^6 with Q its variance given the prior. NaN where the likelihood is zero.
     """
-    if not drawn.extra + log_likelihood(counts, w, background) > -math.inf:
+    o, frame, background = problem.optics, problem.frame, parameters.background
+    level, noise = background[0], at_level(frame.noise, background[0])
+    value = log_likelihood(frame, w, background)
+    if not rendered.extra + value > -math.inf:
         return math.nan
-    fp, boxes, clusters, stamps, factors, fitted, _ = drawn.fitted
-    sigma, scatter, templates = nuisances[3], nuisances[4], stamps.shape[0]
-    pixels = _fisher_weight(counts, w, background)
-    ny, pitch = o.ny, w.image.size // o.ny
-    per_row = w.flags.size // ny
-    sources = basis.row.size
-    size = sources + terms
-    cross = np.zeros((fitted.size * templates, size))
-    band = np.empty((size, BAND, pitch))
-    for top in range(0, ny, BAND):
-        last = min(top + BAND, ny)
-        band[:] = 0.0
-        add_jacobian_rows(o, drawn.maps, fp, basis, fitted, sigma, top, last, band)
-        for j in range(top, last):
-            v = (2 * j - ny + 1) / ny
-            for i in range(pitch):
-                u = (2 * i - o.nx + 1) / o.nx
-                band[sources, j - top, i] = 1.0
-                if terms > 1:
-                    band[sources + 1, j - top, i], band[sources + 2, j - top, i] = u, v
-                if terms > 3:
-                    band[sources + 3, j - top, i], band[sources + 4, j - top, i] = u * u, u * v
-                    band[sources + 5, j - top, i] = v * v
-            start, stop = next_run(w.flags, w.span, per_row, j, w.span[j, 0])
-            while start >= 0:
-                a, b = start * SEGMENT, stop * SEGMENT
-                weight = w.weight[j * pitch + a : j * pitch + b]
-                for k in range(size):
-                    left = band[k, j - top, a:b]
-                    for m in range(k + 1):
-                        out[k, m] += dot(left, band[m, j - top, a:b], weight)
-                start, stop = next_run(w.flags, w.span, per_row, j, stop)
-        if free is not None:
-            for s in range(fitted.size):
-                for j in range(max(top, boxes[s, 0]), min(last, boxes[s, 1])):
-                    i = fp.first[s] + j - boxes[s, 0]
-                    a, b = fp.low[i], fp.low[i] + fp.size[i]
-                    weight = w.weight[j * pitch + a : j * pitch + b]
-                    for t in range(templates):
-                        stamp = stamps[t, fp.start[i] : fp.start[i + 1]]
-                        for k in range(size):
-                            cross[s * templates + t, k] += dot(band[k, j - top, a:b], stamp, weight)
-    out[sources, sources] += pixels / background[0] if pixels > 0.0 else 0.0
-    known = 0.0
-    if free is not None:
-        at = row_starts(fp, pitch)
-        for c in range(clusters.first.size - 1):
-            members, lead, start = one_cluster(clusters, c, templates)
-            n = members.size * templates
-            h = factors[clusters.begin[c] : clusters.begin[c + 1]]
-            gram(fp, boxes, members, lead, start, stamps, w.weight, at, h)
-            for i in range(n):
-                h[start[i] + i] += (
-                    1.0 / fitted[members[i // templates]] ** 2
-                    if i % templates == 0
-                    else 1.0 / scatter**2
-                )
-            cholesky(h, lead, start)  # positive definite: the prior's curvature is
-            column = np.empty(n)
-            for i in range(n):
-                if i % templates > 0:
-                    column[:] = 0.0
-                    column[i] = 1.0
-                    solve(h, lead, start, column)
-                    known += 2.0 * (scatter**2 - column[i]) ** 2 / scatter**6
-            for m in range(size):
-                for i in range(n):
-                    column[i] = cross[members[i // templates] * templates + i % templates, m]
-                solve(h, lead, start, column)
-                for k in range(m, size):
-                    for i in range(n):
-                        out[k, m] -= (
-                            cross[members[i // templates] * templates + i % templates, k]
-                            * column[i]
-                        )
+    profiled, scatter = rendered.profiled, parameters.nuisances.position_scatter
+    _fill_weight(frame, noise, w, background)
+    sigma = parameters.nuisances.psf_sigma
+    layout = Layout(o, rendered.geometry, rendered.footprints, sigma, new_work(o))
+    sources, size = basis.row.size, out.shape[0]
+    cross = np.zeros((rendered.fluxes.size * (3 if scatter > 0.0 else 1), size))
+    jacobian = np.empty((size, BAND, w.image.size // o.ny))
+    for top in range(0, o.ny, BAND):
+        band = _Band(jacobian, top, min(top + BAND, o.ny))
+        jacobian[:] = 0.0
+        add_jacobian_rows(layout, basis, rendered.fluxes, top, band.last, jacobian)
+        _fill_background(frame, band, sources)
+        _add_products(w, band, out)
+        _add_cross(w, band, profiled, cross)
+    out[sources, sources] += unreached(noise, unreached_pixels(frame, w), level)[2]
+    out[sources, sources] += level_derivatives(frame.noise, frame.pixels, level, value)[1]
+    known = _subtract_profiled(w, rendered, profiled, scatter, cross, out)
     for k in range(size):
         for m in range(k):
             out[m, k] = out[k, m]

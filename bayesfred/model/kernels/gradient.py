@@ -1,9 +1,11 @@
-"""Exact gradient of the log-likelihood, the Laplace term included. F, K, B and H are those of `fluxes.py`.
+"""Exact gradient of the log-likelihood, the Laplace term included.
 
-Gradient of the Laplace term. Per pixel let r = n/mu - 1, W = n/mu^2, C = n/mu^3, and for sources s,
-t let Q = H^-1, q_s = sum_t Q_st K_t, h = sum_s K_s q_s. Because dW = -2 C dmu and the maximising F
-moves by dF = Q d(dL/dF), the chain rule gives for any parameter, with z = Q (sum_p C h K + Q_tt /
-F_t^3) and y = sum_t z_t K_t,
+F, K, B and H are those of `fluxes.py`.
+
+Gradient of the Laplace term. Per pixel let r be the score, W = -dr/dmu and C = -1/2 dW/dmu; of
+Poisson counts n/mu - 1, n/mu^2 and n/mu^3. For sources s, t let Q = H^-1, q_s = sum_t Q_st K_t, h =
+sum_s K_s q_s. Because dW = -2 C dmu and the maximising F moves by dF = Q d(dL/dF), the chain rule
+gives for any parameter, with z = Q (sum_p C h K + Q_tt / F_t^3) and y = sum_t z_t K_t,
 
     d log L = sum_p A dB + sum_s sum_p c_s dK_s,   A = r + C h - W y,   c_s = F_s A + z_s r - W q_s.
 
@@ -28,293 +30,282 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.geometry import SEGMENT, new_work, row_starts
-from bayesfred.imaging.kernels.jacobian import Basis, add_basis_sums, basis_row
+from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Layout
+from bayesfred.imaging.kernels.geometry import new_work, row_starts
+from bayesfred.imaging.kernels.jacobian import Rows, basis_row, new_rows
+from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.clusters import (
     add_block,
+    add_prior,
+    add_template,
     cholesky,
-    draw_template,
     gram,
     one_cluster,
     solve,
     touch,
 )
+from bayesfred.model.kernels.contexts import LIMIT, Touching
 from bayesfred.model.kernels.likelihood import (
-    LIMIT,
-    POISSON,
+    U,
     background_row,
     log_likelihood,
     next_run,
+    unreached_pixels,
+    weigh_rows,
+)
+from bayesfred.model.kernels.noise_dispatch import (
+    at_level,
+    derivatives,
+    level_derivatives,
+    unreached,
 )
 
 
-class Rows(NamedTuple):
-    """Buffers for a row of a basis."""
+class _Amplitudes(NamedTuple):
+    """What the weights c_t of the module's derivation are made of."""
 
-    out: Floats
-    samples: Floats
-    powers: Floats
-    work: Floats
+    fluxes: Floats
+    z: Floats  # (s, templates); zero where fluxes are fixed
+    mixed: Floats  # the templates q = Q T; without samples where fluxes are fixed
+    image: Floats  # A
+    at: Ints  # where the footprints' rows begin in the padded frame
 
 
-@inner()
-def _new_rows(o, basis, width):
-    rows = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
-    return Rows(rows, np.empty((9, width)), np.empty((len(o.degree) + 1, width)), new_work(o))
+class _Adjoint(NamedTuple):
+    """What the derivative of the Laplace term is made of."""
+
+    layout: Layout
+    touching: Touching
+    fluxes: Floats
+    score: Floats
+    weight: Floats
+    at: Ints  # where the footprints' rows begin in the padded frame
+    mixed: Floats  # the templates q = Q T
+    constants: Basis
+    rows: Rows
 
 
 @inner()
 def _constants():
-    """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of a template T."""
+    """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of T."""
     one = np.zeros((1, 2), np.int64)
     return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
 
 
 @inner()
-def _weigh(counts, w, background, curve):
-    """Score d log L/d mu and weight -d^2 log L/d mu^2 of every marked pixel; curve = -1/2 d weight/d mu."""
-    ny = w.span.shape[0]
-    per_row = w.flags.size // ny
-    for j in range(ny):
-        c0, c1, c2 = background_row(background, j, ny)
-        start, stop = next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+def _fill_curve(frame, noise, w, background, curve):
+    """C of every marked pixel, zero where masked."""
+    pitch = frame.values.size // frame.ny
+    for j in range(frame.ny):
+        c0, c1, c2 = background_row(background, j, frame.ny)
+        start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
-            for p in range((j * per_row + start) * SEGMENT, (j * per_row + stop) * SEGMENT):
-                u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
                 mu = w.image[p] + c0 + u * (c1 + u * c2)
-                n = counts.values[p]
-                if n <= LIMIT:
-                    w.score[p], w.weight[p], curve[p] = 0.0, 0.0, 0.0
-                elif counts.kind == POISSON and n == 0.0:  # whatever mu: it may be zero, too
-                    w.score[p], w.weight[p], curve[p] = -1.0, 0.0, 0.0
-                elif counts.kind == POISSON:
-                    w.score[p], w.weight[p], curve[p] = (
-                        n / mu - 1.0,
-                        n / (mu * mu),
-                        n / (mu * mu * mu),
-                    )
-                else:
-                    w.score[p], w.weight[p], curve[p] = (n - mu) / c0, 1.0 / c0, 0.0
-            start, stop = next_run(w.flags, w.span, per_row, j, stop)
+                n = frame.values[p]
+                curve[p] = derivatives(noise, n, mu, U(p))[2] if n > LIMIT else 0.0
+            start, stop = next_run(w, j, stop)
 
 
 @inner()
-def _mix(fp, boxes, members, lead, start, lower, stamps, out):
-    """The templates q = Q T of a cluster's sources, added to `out`; returns the diagonal of Q."""
-    size = stamps.shape[0]
-    diagonal, column = np.empty(lead.size), np.empty(lead.size)
-    for i in range(lead.size):
-        s, a = members[i // size], i % size
+def _add_mixed(adjoint, s, t, column, out):
+    """Add sum_b column[b] T_b of source t, where it overlaps source s, to out, a template of s."""
+    fp, boxes, stamps = adjoint.touching.footprints, adjoint.touching.boxes, adjoint.touching.stamps
+    for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+        p = fp.first[s] + j - boxes[s, 0]
+        q = fp.first[t] + j - boxes[t, 0]
+        first = max(fp.low[p], fp.low[q])
+        last = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
+        ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+        for b in range(stamps.shape[0]):
+            for k in range(first, last):
+                out[ps + k] += column[b] * stamps[b, qs + k]
+
+
+@inner()
+def _mix(adjoint, group, lower):
+    """Add a cluster's q = Q T to `mixed`; returns the diagonal of Q."""
+    boxes, members, size = adjoint.touching.boxes, group.members, adjoint.mixed.shape[0]
+    diagonal, column = np.empty(group.lead.size), np.empty(group.lead.size)
+    for i in range(group.lead.size):
+        s = members[i // size]
         column[:] = 0.0
         column[i] = 1.0
-        solve(lower, lead, start, column)
+        solve(lower, group, column)
         diagonal[i] = column[i]
-        for m in range(lead[i] // size, members.size):
+        for m in range(group.lead[i] // size, members.size):
             t = members[m]
             if boxes[t, 0] >= boxes[s, 1]:
                 break
-            if not touch(boxes, s, t):
-                continue
-            for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-                p = fp.first[s] + j - boxes[s, 0]
-                q = fp.first[t] + j - boxes[t, 0]
-                first, last = (
-                    max(fp.low[p], fp.low[q]),
-                    min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q]),
-                )
-                ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
-                for b in range(size):
-                    for k in range(first, last):
-                        out[a, ps + k] += column[m * size + b] * stamps[b, qs + k]
+            if touch(boxes, s, t):
+                own = column[m * size : (m + 1) * size]
+                _add_mixed(adjoint, s, t, own, adjoint.mixed[i % size])
     return diagonal
 
 
 @inner()
-def _second_derivatives(o, w, drawn, s, sigma, mixed, constants, rows, part, i, start, g):
-    """What a source's second derivatives K_xx, K_xy, K_yy and X, Y as dK add to its rows of e and G."""
-    fp, stamps, flux = drawn.fitted.footprints, drawn.fitted.stamps, drawn.fitted.fluxes[s]
-    pitch = w.image.size // w.span.shape[0]
+def _second_derivatives(adjoint, group, i, part, g):
+    """Add what a source's K_xx, K_xy, K_yy, and X, Y as dK, give to its rows of e and G."""
+    fp, stamps, mixed = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.mixed
+    s, out = group.members[i], adjoint.rows.out
+    flux, pitch = adjoint.fluxes[s], out.shape[1]
     xx, xy, yy = np.empty(pitch), np.empty(pitch), np.empty(pitch)
     for p in range(fp.first[s], fp.first[s + 1]):
-        j, low, n = fp.row[p], fp.low[p], fp.size[p]
-        basis_row(
-            o,
-            drawn.maps,
-            constants,
-            s,
-            j,
-            low,
-            n,
-            sigma,
-            np.int64(1),
-            rows.out,
-            rows.samples,
-            rows.powers,
-            rows.work,
-        )
-        xx[:n], xy[:n] = -flux * rows.out[0, :n], -flux * rows.out[1, :n]
-        basis_row(
-            o,
-            drawn.maps,
-            constants,
-            s,
-            j,
-            low,
-            n,
-            sigma,
-            np.int64(2),
-            rows.out,
-            rows.samples,
-            rows.powers,
-            rows.work,
-        )
-        yy[:n] = -flux * rows.out[1, :n]
+        n = fp.size[p]
+        basis_row(adjoint.layout, adjoint.constants, s, p, np.int64(1), adjoint.rows)
+        xx[:n], xy[:n] = -flux * out[0, :n], -flux * out[1, :n]
+        basis_row(adjoint.layout, adjoint.constants, s, p, np.int64(2), adjoint.rows)
+        yy[:n] = -flux * out[1, :n]
         for k in range(n):
-            at, pixel = fp.start[p] + k, j * pitch + low + k
+            at, pixel = fp.start[p] + k, adjoint.at[p] + k
             x, y = stamps[1, at] / flux, stamps[2, at] / flux
-            r, weight = w.score[pixel], w.weight[pixel]
+            r, weight = adjoint.score[pixel], adjoint.weight[pixel]
             q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
             part[0] -= weight * (q1 * x + q2 * y)
             part[1] -= weight * (q0 * x + q1 * xx[k] + q2 * xy[k])
             part[2] -= weight * (q0 * y + q1 * xy[k] + q2 * yy[k])
-            add_block(i, start, g, -r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy[k])
+            add_block(i, group.start, g, (-r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy[k]))
 
 
 @inner()
-def _laplace_adjoint(o, w, drawn, sigma, scatter, curve):
+def _fill_part(adjoint, group, curve, h, part):
+    """Add sum_p T q of a cluster's sources to h, then fill e with sum_p C h T."""
+    fp, stamps, at = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.at
+    size, mixed = stamps.shape[0], adjoint.mixed
+    for s in group.members:
+        for p in range(fp.first[s], fp.first[s + 1]):
+            for t in range(size):
+                for k in range(fp.size[p]):
+                    h[at[p] + k] += stamps[t, fp.start[p] + k] * mixed[t, fp.start[p] + k]
+    for i in range(part.size):
+        s, t = group.members[i // size], i % size
+        part[i] = 0.0
+        for p in range(fp.first[s], fp.first[s + 1]):
+            for k in range(fp.size[p]):
+                part[i] += curve[at[p] + k] * h[at[p] + k] * stamps[t, fp.start[p] + k]
+
+
+@inner()
+def _hessian(adjoint, group, scatter, part, lower):
+    """Cholesky's factor of G; it is positive definite at a maximum, elsewhere H has to do."""
+    size, g = adjoint.mixed.shape[0], np.empty(lower.size)
+    gram(adjoint.touching, group, adjoint.weight, adjoint.at, g)
+    add_prior(g, group, size, adjoint.fluxes, scatter)
+    for i in range(group.members.size):
+        _second_derivatives(adjoint, group, i, part[i * size : (i + 1) * size], g)
+    return g if cholesky(g, group) else lower
+
+
+@inner()
+def _laplace_adjoint(w, layout, rendered, profiled, scatter, curve):
     """z, the templates q, the image A and the derivative by tau of the module's derivation."""
-    fp, boxes, clusters, stamps, factors, flux, shift = drawn.fitted
-    pitch = w.image.size // w.span.shape[0]
-    size, at = stamps.shape[0], row_starts(fp, w.image.size // w.span.shape[0])
-    h, y = np.zeros(w.image.size), np.zeros(w.image.size)
-    z = np.empty((flux.size, size))
-    mixed = np.zeros(stamps.shape)
-    constants = _constants()
-    rows = _new_rows(o, constants, pitch)
+    if profiled is None:
+        return np.zeros((rendered.fluxes.size, 1)), np.empty((1, 0)), w.score, 0.0
+    touching, flux, shift = profiled.touching, rendered.fluxes, profiled.shifts
+    fp, clusters, stamps = touching.footprints, touching.clusters, touching.stamps
+    size, pitch, constants = stamps.shape[0], w.image.size // w.span.shape[0], _constants()
+    h, y, z = np.zeros(w.image.size), np.zeros(w.image.size), np.empty((flux.size, size))
+    at, mixed = row_starts(fp, pitch), np.zeros(stamps.shape)
+    rows = new_rows(layout.optics, constants, pitch)
+    adjoint = _Adjoint(layout, touching, flux, w.score, w.weight, at, mixed, constants, rows)
     slope = 0.0
     for c in range(clusters.first.size - 1):
-        members, lead, start = one_cluster(clusters, c, size)
-        n = members.size * size
-        lower = factors[clusters.begin[c] : clusters.begin[c + 1]]
-        diagonal = _mix(fp, boxes, members, lead, start, lower, stamps, mixed)
-        for s in members:
-            for p in range(fp.first[s], fp.first[s + 1]):
-                for t in range(size):
-                    for k in range(fp.size[p]):
-                        h[at[p] + k] += stamps[t, fp.start[p] + k] * mixed[t, fp.start[p] + k]
-        part = np.zeros(n)
-        for i in range(n):
-            s, t = members[i // size], i % size
-            for p in range(fp.first[s], fp.first[s + 1]):
-                for k in range(fp.size[p]):
-                    part[i] += curve[at[p] + k] * h[at[p] + k] * stamps[t, fp.start[p] + k]
-            if t == 0:
-                part[i] += diagonal[i] / flux[s] ** 3
+        group = one_cluster(clusters, c, size)
+        lower = profiled.factors[clusters.begin[c] : clusters.begin[c + 1]]
+        diagonal = _mix(adjoint, group, lower)
+        part = np.empty(diagonal.size)
+        _fill_part(adjoint, group, curve, h, part)
+        for i in range(0, part.size, size):
+            part[i] += diagonal[i] / flux[group.members[i // size]] ** 3
         if size > 1:
-            g = np.empty(lower.size)
-            gram(fp, boxes, members, lead, start, stamps, w.weight, at, g)
-            for i in range(n):
-                g[start[i] + i] += (
-                    1.0 / flux[members[i // size]] ** 2 if i % size == 0 else 1.0 / scatter**2
-                )
-            for i in range(members.size):
-                own = part[i * size : (i + 1) * size]
-                _second_derivatives(
-                    o, w, drawn, members[i], sigma, mixed, constants, rows, own, i, start, g
-                )
-            if cholesky(
-                g, lead, start
-            ):  # it is positive definite at a maximum; elsewhere H has to do
-                lower = g
-        solve(lower, lead, start, part)
-        for i in range(n):
-            s, t = members[i // size], i % size
+            lower = _hessian(adjoint, group, scatter, part, lower)
+        solve(lower, group, part)
+        for i in range(part.size):
+            s, t = group.members[i // size], i % size
             z[s, t] = part[i]
-            draw_template(fp, s, stamps[t], part[i], at, y)
+            add_template(fp, s, stamps[t], part[i], Canvas(y, at))
             if t > 0:
                 d = shift[s, t - 1]
                 slope += (d * d + diagonal[i] + 2.0 * part[i] * d) / scatter**3 - 1.0 / scatter
-    for j in range(w.span.shape[0]):
-        for p in range(
-            j * pitch + w.span[j, 0] * SEGMENT, j * pitch + (w.span[j, 1] + 1) * SEGMENT
-        ):
-            if w.flags[p // SEGMENT]:
+    for k in range(w.flags.size):
+        if w.flags[k] != 0:
+            for p in range(k * SEGMENT, (k + 1) * SEGMENT):
                 h[p] = w.score[p] + curve[p] * h[p] - w.weight[p] * y[p]
     return z, mixed, h, slope
 
 
 @inner()
-def _background_gradient(counts, w, background, image, out):
-    """Sum of the image times 1, u, v, u^2, uv, v^2 over the likelihood's pixels."""
-    ny = w.span.shape[0]
-    per_row = w.flags.size // ny
-    pixels, rest = counts.pixels, counts.total
-    for j in range(ny):
-        v = (2 * j - ny + 1) / ny
-        start, stop = next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+def _add_background(frame, w, image, out):
+    """Add the sum of the image times 1, u, v, u^2, uv, v^2 over the marked pixels."""
+    pitch = frame.values.size // frame.ny
+    for j in range(frame.ny):
+        v = (2 * j - frame.ny + 1) / frame.ny
+        start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
-            for p in range((j * per_row + start) * SEGMENT, (j * per_row + stop) * SEGMENT):
-                if counts.values[p] > LIMIT:
-                    u = (2 * (p - j * per_row * SEGMENT) - counts.nx + 1) / counts.nx
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                if frame.values[p] > LIMIT:
+                    u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
                     out[0] += image[p]
                     out[1] += image[p] * u
                     out[2] += image[p] * v
                     out[3] += image[p] * u * u
                     out[4] += image[p] * u * v
                     out[5] += image[p] * v * v
-            for k in range(j * per_row + start, j * per_row + stop):
-                pixels -= counts.segment_pixels[k]
-                rest -= counts.segment_sum[k]
-            start, stop = next_run(w.flags, w.span, per_row, j, stop)
-    if pixels > 0.0:
-        out[0] += (
-            rest / background[0] - pixels
-            if counts.kind == POISSON
-            else (rest - background[0] * pixels) / background[0]
-        )
+            start, stop = next_run(w, j, stop)
+
+
+@inner()
+def _fill_weights(w, fp, a, s, t, out):
+    """c_t of source s at every sample of its footprint."""
+    flux, z, begin = a.fluxes[s], a.z[s, t], fp.start[fp.first[s]]
+    amplitude = 1.0 if t == 0 else flux
+    for p in range(fp.first[s], fp.first[s + 1]):
+        q, at = fp.start[p], a.at[p]
+        for k in range(fp.size[p]):
+            out[q - begin + k] = flux * a.image[at + k] if t == 0 else 0.0
+        if a.mixed.size > 0:
+            for k in range(fp.size[p]):
+                own = z * w.score[at + k] - w.weight[at + k] * a.mixed[t, q + k]
+                out[q - begin + k] += amplitude * own
 
 
 @entry()
-def gradient(o, counts, w, drawn, nuisances, background, free, basis, out, out_background):
-    """Exact gradient of the log-likelihood: source parameters in `out`, background coefficients in `out_background`.
+def gradient(problem, w, rendered, parameters, basis, out):
+    """Exact gradient of the log-likelihood.
 
-    Returns the derivative with respect to position_scatter, NaN where the likelihood is zero, and
-    z.
+    `out` are two arrays: for the source parameters and the background coefficients. Returns the
+    derivative with respect to position_scatter, NaN where the likelihood is zero, and z.
     """
-    if not drawn.extra + log_likelihood(counts, w, background) > -math.inf:
+    o, frame, background = problem.optics, problem.frame, parameters.background
+    level, noise = background[0], at_level(frame.noise, background[0])
+    value = log_likelihood(frame, w, background)
+    if not rendered.extra + value > -math.inf:
         return math.nan, np.empty((0, 0))
-    maps, fp, fluxes, sigma = drawn.maps, drawn.fitted.footprints, drawn.fitted.fluxes, nuisances[3]
-    size = drawn.fitted.stamps.shape[0]
+    fp, pitch = rendered.footprints, w.image.size // o.ny
+    layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
     curve = np.empty(w.image.size)
-    _weigh(counts, w, background, curve)
-    image = w.score
-    z, mixed, slope = np.zeros((fluxes.size, size)), np.empty((size, 0)), 0.0
-    if free is not None:
-        z, mixed, image, slope = _laplace_adjoint(o, w, drawn, sigma, nuisances[4], curve)
-    _background_gradient(counts, w, background, image, out_background)
-    pitch = w.image.size // o.ny
-    most, reach = 0, 2 * len(o.degree) + 1
+    weigh_rows(frame, noise, w, background, 0, o.ny)
+    _fill_curve(frame, noise, w, background, curve)
+    scatter = parameters.nuisances.position_scatter
+    z, mixed, image, slope = _laplace_adjoint(
+        w, layout, rendered, rendered.profiled, scatter, curve
+    )
+    _add_background(frame, w, image, out[1])
+    out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]
+    out[1][0] += level_derivatives(frame.noise, frame.pixels, level, value)[0]
+    most = 0
     for s in range(o.x.size):
         most = max(most, fp.start[fp.first[s + 1]] - fp.start[fp.first[s]])
-    samples, work, sums = np.empty((6, pitch)), np.empty((8, reach)), np.empty((7, reach, reach))
-    c, moments = np.empty(most), np.empty(basis.f.shape[0] + basis.g.shape[0] + 2)
+    sums, weights = new_sums(o, basis, pitch), np.empty(most)
+    amplitudes = _Amplitudes(rendered.fluxes, z, mixed, image, row_starts(fp, pitch))
     for s in range(o.x.size):
-        moments[:] = 0.0
-        begin = fp.start[fp.first[s]]
-        for t in range(size):
-            for p in range(fp.first[s], fp.first[s + 1]):
-                q, n, at = fp.start[p], fp.size[p], fp.row[p] * pitch + fp.low[p]
-                for k in range(n):
-                    c[q - begin + k] = fluxes[s] * image[at + k] if t == 0 else 0.0
-                if free is not None:
-                    amplitude = 1.0 if t == 0 else fluxes[s]
-                    for k in range(n):
-                        c[q - begin + k] += amplitude * (
-                            z[s, t] * w.score[at + k] - w.weight[at + k] * mixed[t, q + k]
-                        )
-            add_basis_sums(o, maps, fp, basis, s, sigma, t, c, moments, samples, sums, work)
+        sums.out[:] = 0.0
+        for t in range(z.shape[1]):
+            _fill_weights(w, fp, amplitudes, s, t, weights)
+            add_basis_sums(layout, basis, s, t, weights, sums)
         for k in range(basis.row.size):
-            out[k] += basis.lever[s, k] * moments[basis.row[k]]
+            out[0][k] += basis.factors[s, k] * sums.out[basis.row[k]]
     return slope, z

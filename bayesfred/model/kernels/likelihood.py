@@ -1,89 +1,58 @@
-"""The frame and a thread's buffers as the loops need them, and the log-likelihood of an image.
+"""The log-likelihood of an image, and the score and weight of its pixels.
 
 Only pixels that a source reaches are visited one by one: `Workspace.flags` marks them in segments,
-and where the background is constant the rest enters through its counts and number alone. The
-workspace's image is zero between calls; whoever reads it clears it.
+and where the background is constant the noise model may sum up the rest. The workspace's image is
+zero between calls; whoever reads it clears it.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, log
-from bayesfred.imaging.kernels.geometry import SEGMENT, footprints, locate, new_maps
+from bayesfred.imaging.kernels.contexts import SEGMENT
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
+from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
+from bayesfred.model.kernels.contexts import LIMIT, Unreached, Workspace
+from bayesfred.model.kernels.noise_dispatch import at_level, derivatives, log_density, unreached
 
-Flags = npt.NDArray[np.uint8]
-
-MASKED = -1e300  # stands for the counts of a pixel outside the likelihood
-LIMIT = -1e299
-
-POISSON = 0
-GAUSSIAN = 1  # variance equal to the background: the paper's noise
+U = np.uint64  # an index that has no sign need not be compared with zero
 
 
-class Counts(NamedTuple):
-    """The frame as the loops need it; rows are padded to `stride`, pixels outside the likelihood are MASKED.
+class Stretch(NamedTuple):
+    """Pixels of a row: from pixel `first` of the padded frame on."""
 
-    Read noise is in it already: its variance is added to the values here and to the constant
-    background on every call.
-    """
-
-    values: Floats  # (ny * stride,)
-    segment_pixels: Floats  # (ny * stride / SEGMENT,) how many pixels count
-    segment_sum: Floats  # of their counts
-    segment_squares: Floats
-    pixels: float
-    total: float
-    nx: int
-    kind: int
-    varies: bool  # whether the background is a polynomial of order > 0
-
-
-class Workspace(NamedTuple):
-    """A thread's buffers."""
-
-    image: Floats  # (ny * stride,), zero between calls
-    flags: Flags  # (ny * stride / SEGMENT,) segments that a source reaches
-    span: Ints  # (ny, 2) first and last marked segment of a row
-    score: Floats  # (ny * stride,) scratch
-    weight: Floats
-    # what profiling fills anew on every call, kept because new memory costs more than its use
-    heap: Floats
+    values: Floats
+    image: Floats
+    first: int
+    # the background c0 + x (c1 + x c2) at x = u + step i
+    c0: float
+    c1: float
+    c2: float
+    u: float
+    step: float
 
 
 @entry()
 def new_workspace(o, nuisances, free):
-    """Buffers for one thread; with free fluxes they hold the templates as they are without a distortion and a quarter more."""
+    """Buffers for one thread.
+
+    With free fluxes they hold the templates as they are without a distortion and a quarter more.
+    """
     ny, pitch = o.ny, o.ramp.size
     span = np.empty((ny, 2), np.int64)
     span[:, 0] = pitch
     span[:, 1] = -1
-    size, room = ny * pitch, 0
+    size, more = ny * pitch, 0
     if free is not None:
-        maps = new_maps(o)
-        locate(
-            o,
-            np.zeros(o.f_powers.shape[0] + o.g_powers.shape[0]),
-            0.0,
-            0.0,
-            nuisances[3],
-            6.0 * nuisances[4],
-            maps,
-        )
-        fp = footprints(o, maps)
-        room = 3 * size + (5 if nuisances[4] == 0.0 else 15) * fp.start[fp.row.size] // 4
-    return Workspace(
-        np.zeros(size),
-        np.zeros(size // SEGMENT, np.uint8),
-        span,
-        np.empty(size),
-        np.empty(size),
-        np.empty(room),
-    )
+        geometry = new_geometry(o)
+        locate(o, np.zeros(o.f_powers.shape[0] + o.g_powers.shape[0]), nuisances, geometry)
+        samples = find_footprints(o, geometry).start[-1]
+        more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
+    flags = np.zeros(size // SEGMENT, np.uint8)
+    return Workspace(np.zeros(size), flags, span, np.empty(size), np.empty(size), np.empty(more))
 
 
 @inner()
@@ -93,14 +62,21 @@ def room(w, first, size):
 
 
 @inner()
-def mark_sources(fp, w):
+def mark(frame, fp, w):
+    """Mark the segments that are visited: those that a source reaches, or all that count."""
+    _mark_sources(fp, w)
+    if frame.everywhere:
+        _mark_counted(frame, w)
+
+
+@inner()
+def _mark_sources(fp, w):
     """Mark the segments that the sources' rows of pixels lie in."""
     flags, span, lows, rows, sizes = w.flags, w.span, fp.low, fp.row, fp.size
     per_row = flags.size // span.shape[0]
     pitch = per_row + 1
-    change = np.zeros(
-        span.shape[0] * pitch, np.int32
-    )  # in the number of rows on a segment: two writes for a row of any length
+    # change in the number of rows on a segment: two writes for a row of any length
+    change = np.zeros(span.shape[0] * pitch, np.int32)
     for i in range(rows.size):
         j, a, b = rows[i], lows[i] // SEGMENT, (lows[i] + sizes[i] - 1) // SEGMENT
         span[j, 0] = min(span[j, 0], a)
@@ -115,28 +91,31 @@ def mark_sources(fp, w):
 
 
 @inner()
-def mark_counted(counts, w):
-    """Mark every segment with a pixel in the likelihood: a background that varies must be visited everywhere."""
+def _mark_counted(frame, w):
+    """Mark every segment with a pixel in the likelihood."""
     per_row = w.flags.size // w.span.shape[0]
     for j in range(w.span.shape[0]):
         for k in range(per_row):
-            if counts.segment_pixels[j * per_row + k] > 0.0:
+            if frame.segment_pixels[j * per_row + k] > 0.0:
                 w.flags[j * per_row + k] = 1
                 w.span[j, 0] = min(w.span[j, 0], k)
                 w.span[j, 1] = max(w.span[j, 1], k)
 
 
 @inner()
-def next_run(flags, span, per_row, j, k):
-    """The next marked stretch of row j at or after segment k, as segments [start, stop); start < 0 if there is none."""
-    last = span[j, 1]
-    base = j * per_row
-    while k <= last and flags[base + k] == 0:
+def next_run(w, j, k):
+    """The next marked stretch of row j at or after segment k, as segments [start, stop).
+
+    start < 0 if there is none.
+    """
+    last = w.span[j, 1]
+    base = j * (w.flags.size // w.span.shape[0])
+    while k <= last and w.flags[base + k] == 0:
         k += 1
     if k > last:
         return -1, -1
     start = k
-    while k <= last and flags[base + k] != 0:
+    while k <= last and w.flags[base + k] != 0:
         k += 1
     return start, k
 
@@ -157,92 +136,99 @@ def clear(w):
 
 @inner()
 def background_row(background, j, ny):
-    """Coefficients of the background polynomial on row j in powers of u; u, v run from -1 to 1 over the frame."""
+    """Coefficients of the background on row j in powers of u, which runs from -1 to 1."""
     v = (2 * j - ny + 1) / ny
     c0 = background[0] + v * (background[2] + v * background[5])
     return c0, background[1] + v * background[4], background[3]
 
 
-@inner(fastmath=FAST)
-def _slope_run(image, u, step, c1, c2, out):
-    """The image of a stretch plus the part of the background that varies along it."""
-    for i in range(image.size):
+@inner()
+def stretch(frame, background, j, first, image):
+    """The pixels of row j from pixel `first` of the padded frame on, as many as in `image`."""
+    low = first - j * (frame.values.size // frame.ny)
+    c0, c1, c2 = background_row(background, j, frame.ny)
+    u, step = (2 * low - frame.nx + 1) / frame.nx, 2.0 / frame.nx
+    return Stretch(frame.values[first : first + image.size], image, first, c0, c1, c2, u, step)
+
+
+@inner(fastmath=FAST, error_model="numpy")
+def weigh_run(noise, part, score, weight):
+    """Score d log L/d mu and weight -d^2 log L/d mu^2 of a stretch, zero where masked."""
+    values, image, first = part.values, part.image, part.first
+    c0, c1, c2, u, step = part.c0, part.c1, part.c2, part.u, part.step
+    for i in range(values.size):
         x = u + step * i
-        out[i] = image[i] + x * (c1 + x * c2)
+        mu = image[i] + (c0 + x * (c1 + x * c2))
+        counted = values[i] > LIMIT
+        s, w, _ = derivatives(noise, values[i] if counted else mu, mu, U(first + i))
+        score[i], weight[i] = s if counted else 0.0, w if counted else 0.0
+
+
+@inner()
+def weigh_rows(frame, noise, w, background, top, last):
+    """Score and weight of the marked pixels in rows top..last-1."""
+    pitch = frame.values.size // frame.ny
+    for j in range(top, last):
+        start, stop = next_run(w, j, w.span[j, 0])
+        while start >= 0:
+            a, b = j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT
+            part = stretch(frame, background, j, a, w.image[a:b])
+            weigh_run(noise, part, w.score[a:b], w.weight[a:b])
+            start, stop = next_run(w, j, stop)
+
+
+@inner(fastmath=FAST)
+def _slope_run(part, out):
+    """The image of a stretch plus the part of the background that varies along it."""
+    for i in range(out.size):
+        x = part.u + part.step * i
+        out[i] = part.image[i] + x * (part.c1 + x * part.c2)
 
 
 @inner(fastmath=REDUCE, error_model="numpy")
-def _poisson_run(image, values, level):
-    """Sum of n log(mu) - mu over the unmasked pixels of a stretch; MASKED or less if one of these has no positive mu."""
+def _density_run(noise, values, image, level, first):
+    """Sum of the log-densities of the unmasked pixels of a stretch."""
     total = 0.0
     for i in range(image.size):
         mu = image[i] + level
-        n = values[i]
-        term = (
-            n * log(mu) - mu if mu > 0.0 else MASKED
-        )  # neither a branch nor a minimum: the loop would not vectorise
-        total += term if n > LIMIT else 0.0
-    return total
-
-
-@inner(fastmath=REDUCE)
-def _sum(values):
-    total = 0.0
-    for i in range(values.size):
-        total += values[i]
-    return total
-
-
-@inner(fastmath=REDUCE, error_model="numpy")
-def _square_run(image, values, level):
-    """Sum of (n - mu)^2 over the unmasked pixels of a stretch."""
-    total = 0.0
-    for i in range(image.size):
-        d = values[i] - (image[i] + level)
-        total += d * d if values[i] > LIMIT else 0.0
+        counted = values[i] > LIMIT
+        term = log_density(noise, values[i] if counted else mu, mu, U(first + i))
+        total += term if counted else 0.0
     return total
 
 
 @inner()
-def log_likelihood(counts, w, background):
-    """Log-likelihood of the workspace's image plus the background; what depends on the counts alone is left out."""
-    ny = w.span.shape[0]
-    per_row = w.flags.size // ny
+def unreached_pixels(frame, w):
+    """The pixels that no source reaches."""
+    per_row = w.flags.size // frame.ny
+    pixels, counts = frame.pixels, frame.total
+    for j in range(frame.ny):
+        for k in range(j * per_row + w.span[j, 0], j * per_row + w.span[j, 1] + 1):
+            if w.flags[k] != 0:
+                pixels -= frame.segment_pixels[k]
+                counts -= frame.segment_sum[k]
+    return Unreached(pixels, counts, w.flags)
+
+
+@inner()
+def log_likelihood(frame, w, background):
+    """Log-likelihood of the workspace's image plus the background.
+
+    What depends on the counts alone is left out.
+    """
+    noise, level = at_level(frame.noise, background[0]), background[0]
+    pitch = frame.values.size // frame.ny
     total = 0.0
-    pixels, rest = counts.pixels, counts.total
-    for j in range(ny):
-        c0, c1, c2 = background_row(background, j, ny)
-        start, stop = next_run(w.flags, w.span, per_row, j, w.span[j, 0])
+    for j in range(frame.ny):
+        start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
-            a = (j * per_row + start) * SEGMENT
-            b = (j * per_row + stop) * SEGMENT
+            a, b = j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT
             image = w.image[a:b]
-            if counts.varies:
-                image = w.score[a:b]
-                u = (2 * start * SEGMENT - counts.nx + 1) / counts.nx
-                _slope_run(w.image[a:b], u, 2.0 / counts.nx, c1, c2, image)
-            if counts.kind == POISSON:
-                total += _poisson_run(image, counts.values[a:b], c0)
-            else:
-                total += _square_run(image, counts.values[a:b], c0)
-            pixels -= _sum(counts.segment_pixels[j * per_row + start : j * per_row + stop])
-            rest -= _sum(counts.segment_sum[j * per_row + start : j * per_row + stop])
-            start, stop = next_run(w.flags, w.span, per_row, j, stop)
-    level = background[0]
-    if (
-        counts.kind == GAUSSIAN
-    ):  # afresh: what is left of the totals would have lost its digits to bright sources
-        pixels, rest, squares = 0.0, 0.0, 0.0
-        for k in range(w.flags.size):
-            if w.flags[k] == 0:
-                pixels += counts.segment_pixels[k]
-                rest += counts.segment_sum[k]
-                squares += counts.segment_squares[k]
-    if total < LIMIT or (level <= 0.0 and (pixels > 0.0 or counts.kind == GAUSSIAN)):
-        return -math.inf
-    if counts.kind == GAUSSIAN:
-        total += squares - 2.0 * level * rest + level * level * pixels
-        return -0.5 * total / level - 0.5 * counts.pixels * math.log(2.0 * math.pi * level)
-    if pixels > 0.0:
-        total += rest * math.log(level) - pixels * level
-    return total
+            if frame.varies:
+                part = stretch(frame, background, j, a, image)
+                level, image = part.c0, w.score[a:b]
+                _slope_run(part, image)
+            total += _density_run(noise, frame.values[a:b], image, level, a)
+            start, stop = next_run(w, j, stop)
+    rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
+    return -math.inf if total + rest < LIMIT else total + rest

@@ -1,178 +1,130 @@
-"""Reference point spread functions: the p of the Fredholm model, normalised to unit volume.
-
-Every kind has one width, `sigma`: that of the Gaussian with the same full width at half maximum,
-FWHM = 2.355 sigma. Where inference leaves the PSF's width free, this is the parameter, and p widens
-as a whole, p(a s, b s) s^2 with s the ratio of widths. `forward.py` samples PSFs through the
-compiled loops; lengths are in pixels of the fine grid.
-"""
-
-from __future__ import annotations
+"""A PSF of any shape: the cubic spline through samples of it."""
 
 import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, NamedTuple, Self
 
+import numba as nb
 import numpy as np
 import numpy.typing as npt
 from scipy import linalg, ndimage, special
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.kernels.psf_profiles import Gaussian, Moffat, Spline
 from bayesfred.io.serialize import serializable
 
-FWHM = math.sqrt(8.0 * math.log(2.0))  # of a Gaussian of unit width
-LARGEST_BETA = 100.0  # beyond, (1 + x)^-beta loses digits, and is a Gaussian to 1 %
-MOST_SAMPLES = 1001  # of a sampled PSF, a side
+MOST_SAMPLES = 1001  # a side
 MARGIN = 4  # zeros around a spline's coefficients
 
 
-@serializable("psf.gaussian")
-@dataclass(frozen=True)
-class GaussianPSF:
-    """Circular Gaussian, p(a, b) = exp(-(a^2 + b^2) / 2 sigma^2) / (2 pi sigma^2).
+class SplineProfile(NamedTuple):
+    """norm times a cubic spline, see `imaging/kernels/psf_dispatch`.
 
-    Parameters
-    ----------
-    sigma : float, pixel
-        Standard deviation along each axis; the full width at half maximum is 2.355 sigma.
-
-    Raises
-    ------
-    InputError
-        If `sigma` is not a positive finite number.
-
-    References
-    ----------
-    Sun & Zhou, Section 2.3 (the reference PSF of their simulations).
-
-    Examples
-    --------
-    >>> round(GaussianPSF(10.0).peak, 9)
-    0.001591549
+    The spline is the sum of c[j, i] B(y - j) B(x - i), with B the cubic B-spline and (x, y) =
+    scale (a, b) counted from the middle of c. The four outermost rows and columns of c are zero.
     """
 
-    sigma: float
+    norm: float
+    c: Floats
+    scale: float  # samples per width
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.sigma) and self.sigma > 0):
-            raise InputError(f"psf: sigma: got {self.sigma}, expected a positive width in pixels")
-        object.__setattr__(self, "sigma", float(self.sigma))
+    @staticmethod
+    def value(psf: Any, a: Any, b: Any) -> Any:
+        i, x = _cell(psf.c.shape[1], psf.scale * a)
+        j, y = _cell(psf.c.shape[0], psf.scale * b)
+        return _inner(_weights(y), _four(psf.c, j, i, _weights(x)))
 
-    @property
-    def peak(self) -> float:
-        """Largest value of the PSF, per square pixel."""
-        return 1.0 / (2.0 * math.pi * self.sigma**2)
+    @staticmethod
+    def slopes(psf: Any, a: Any, b: Any) -> Any:
+        k = psf.scale
+        i, x = _cell(psf.c.shape[1], k * a)
+        j, y = _cell(psf.c.shape[0], k * b)
+        rows, slopes, v = (
+            _four(psf.c, j, i, _weights(x)),
+            _four(psf.c, j, i, _slopes(x)),
+            _weights(y),
+        )
+        return _inner(v, rows), -k * _inner(v, slopes), -k * _inner(_slopes(y), rows)
 
-    @property
-    def core(self) -> tuple[float, float]:
-        """Arguments of `Detector.quadrature`: the width that the peak's curvature gives, pixel, and the exponent of the wings."""
-        return self.sigma, math.inf
-
-    @property
-    def profile(self) -> Gaussian:
-        """The PSF of unit width as the compiled loops need it."""
-        return Gaussian(1.0 / (2.0 * math.pi))
-
-    def reach(self, tolerance: float) -> float:
-        """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel."""
-        return self.sigma * math.sqrt(-2.0 * math.log(tolerance)) if tolerance > 0 else math.inf
-
-    def density(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Floats:
-        """The PSF at (a, b), pixel from its middle; per square pixel."""
-        return np.asarray(self.peak * np.exp(-0.5 * (np.square(a) + np.square(b)) / self.sigma**2))
-
-
-@serializable("psf.moffat")
-@dataclass(frozen=True)
-class MoffatPSF:
-    """Circular Moffat function, p(a, b) = (beta - 1) / (pi alpha^2) (1 + (a^2 + b^2) / alpha^2)^-beta.
-
-    Its wings fall as a power and reach far: with beta 3 it is above 1e-8 of its peak within 21
-    alpha. Beyond a tolerance t lies the part t^(1 - 1/beta) of the flux, which is not counted: 5e-6
-    of it in this case.
-
-    Parameters
-    ----------
-    fwhm : float, pixel
-        Full width at half maximum, 2 alpha sqrt(2^(1/beta) - 1).
-    beta : float
-        Exponent of the wings: > 1, without which their flux has no bound, and at most 100. It tends
-        to a Gaussian as beta grows.
-
-    Raises
-    ------
-    InputError
-        If `fwhm` is not a positive finite number, or `beta` is out of range.
-
-    References
-    ----------
-    A. F. J. Moffat, "A theoretical investigation of focal stellar images in the photographic
-    emulsion and application to photographic photometry", Astronomy & Astrophysics 3, 455 (1969).
-
-    Examples
-    --------
-    >>> psf = MoffatPSF(fwhm=4.0, beta=3.0)
-    >>> round(float(psf.density(2.0, 0.0) / psf.peak), 9), round(psf.sigma, 3)
-    (0.5, 1.699)
-    """
-
-    fwhm: float
-    beta: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.fwhm) and self.fwhm > 0):
-            raise InputError(f"psf: fwhm: got {self.fwhm}, expected a positive width in pixels")
-        if not 1.0 < self.beta <= LARGEST_BETA:
-            raise InputError(
-                f"psf: beta: got {self.beta}, expected 1 < beta <= {LARGEST_BETA:g}: use a "
-                "Gaussian in place of larger ones"
-            )
-        object.__setattr__(self, "fwhm", float(self.fwhm))
-        object.__setattr__(self, "beta", float(self.beta))
-
-    @property
-    def sigma(self) -> float:
-        """Width of the Gaussian with the same full width at half maximum, pixel."""
-        return self.fwhm / FWHM
-
-    @property
-    def alpha(self) -> float:
-        """Radius of the core, pixel."""
-        return 0.5 * self.fwhm / math.sqrt(math.expm1(math.log(2.0) / self.beta))
-
-    @property
-    def peak(self) -> float:
-        """Largest value of the PSF, per square pixel."""
-        return (self.beta - 1.0) / (math.pi * self.alpha**2)
-
-    @property
-    def core(self) -> tuple[float, float]:
-        """Arguments of `Detector.quadrature`: the width that the peak's curvature gives, pixel, and the exponent of the wings."""
-        return self.alpha / math.sqrt(2.0 * self.beta), self.beta
-
-    @property
-    def profile(self) -> Moffat:
-        """The PSF of unit width as the compiled loops need it."""
-        square = (self.alpha / self.sigma) ** 2
-        return Moffat((self.beta - 1.0) / (math.pi * square), square, self.beta)
-
-    def reach(self, tolerance: float) -> float:
-        """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel."""
+    @staticmethod
+    def second_derivatives(psf: Any, a: Any, b: Any) -> Any:
+        k = psf.scale
+        i, x = _cell(psf.c.shape[1], k * a)
+        j, y = _cell(psf.c.shape[0], k * b)
+        rows, slopes = _four(psf.c, j, i, _weights(x)), _four(psf.c, j, i, _slopes(x))
+        curves = _four(psf.c, j, i, _second_derivatives(x))
+        v, e = _weights(y), _slopes(y)
         return (
-            self.alpha * math.sqrt(tolerance ** (-1.0 / self.beta) - 1.0)
-            if tolerance > 0
-            else math.inf
+            -k * _inner(v, slopes),
+            -k * _inner(e, rows),
+            k * k * _inner(v, curves),
+            k * k * _inner(e, slopes),
+            k * k * _inner(_second_derivatives(y), rows),
         )
 
-    def density(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Floats:
-        """The PSF at (a, b), pixel from its middle; per square pixel."""
-        return np.asarray(
-            self.peak * (1.0 + (np.square(a) + np.square(b)) / self.alpha**2) ** -self.beta
-        )
+
+@nb.njit(inline="always")
+def _cell(size: Any, x: Any) -> Any:
+    """The first of the four coefficients that matter at x, and where x is in the cell.
+
+    x is in samples from the middle. Beyond the outermost coefficients the spline is zero, as it is
+    among the last four.
+    """
+    x = min(max(x + 0.5 * (size - 1), 1.0), size - 2.5)
+    i = np.int64(x)
+    return i - 1, x - i
+
+
+@nb.njit(inline="always")
+def _weights(f: Any) -> Any:
+    """The B-splines of four neighbouring samples, f of a step after the second."""
+    g = 1.0 - f
+    return (
+        g * g * g / 6.0,
+        2.0 / 3.0 - f * f * (1.0 - 0.5 * f),
+        2.0 / 3.0 - g * g * (1.0 - 0.5 * g),
+        f * f * f / 6.0,
+    )
+
+
+@nb.njit(inline="always")
+def _slopes(f: Any) -> Any:
+    g = 1.0 - f
+    return -0.5 * g * g, f * (1.5 * f - 2.0), -g * (1.5 * g - 2.0), 0.5 * f * f
+
+
+@nb.njit(inline="always")
+def _second_derivatives(f: Any) -> Any:
+    g = 1.0 - f
+    return g, 3.0 * f - 2.0, 3.0 * g - 2.0, f
+
+
+@nb.njit(inline="always")
+def _inner(p: Any, q: Any) -> Any:
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
+
+
+@nb.njit(inline="always")
+def _four(c: Any, j: Any, i: Any, w: Any) -> Any:
+    """The weighted sums of four coefficients on four rows."""
+    return (
+        w[0] * c[j, i] + w[1] * c[j, i + 1] + w[2] * c[j, i + 2] + w[3] * c[j, i + 3],
+        w[0] * c[j + 1, i]
+        + w[1] * c[j + 1, i + 1]
+        + w[2] * c[j + 1, i + 2]
+        + w[3] * c[j + 1, i + 3],
+        w[0] * c[j + 2, i]
+        + w[1] * c[j + 2, i + 1]
+        + w[2] * c[j + 2, i + 2]
+        + w[3] * c[j + 2, i + 3],
+        w[0] * c[j + 3, i]
+        + w[1] * c[j + 3, i + 1]
+        + w[2] * c[j + 3, i + 2]
+        + w[3] * c[j + 3, i + 3],
+    )
 
 
 @serializable("psf.sampled")
@@ -211,8 +163,8 @@ class SampledPSF:
     --------
     >>> x = np.arange(-48, 49) / 4
     >>> psf = SampledPSF(np.exp(-(x**2 + x[:, None] ** 2) / 8), oversampling=4)
-    >>> round(psf.sigma, 2), round(float(psf.density(1.1, 0.3) / GaussianPSF(2.0).density(1.1, 0.3)), 5)
-    (2.0, 1.0)
+    >>> round(psf.sigma, 2), round(float(psf.density(1.1, 0.3)) * 8 * np.pi, 4)
+    (2.0, 0.85)
     """
 
     values: Floats
@@ -263,9 +215,9 @@ class SampledPSF:
         background: float = 0.0,
         oversampling: int = 4,
     ) -> Self:
-        """Measure the PSF on a spot that stands alone, near the axis where distortion vanishes.
+        """Measure the PSF on one isolated source near the axis, where distortion vanishes.
 
-        Whittaker and Shannon's interpolation in its finite form: a spot that is band-limited and
+        Whittaker and Shannon's interpolation in its finite form: an image that is band-limited and
         dark at its window's border is the trigonometric polynomial through its pixels. Samples are
         exact for a Gaussian of sigma >= 2 pixels to 1e-7 of the peak, and the noise of the counts
         goes into them as it is. Of a frame that integrates over pixels the PSF is measured with the
@@ -276,9 +228,9 @@ class SampledPSF:
         ----------
         counts : array_like, shape (ny, nx), counts
         position : (float, float), pixel
-            Where the spot is, u and v from the frame's middle.
+            Where the source is imaged, u and v from the frame's middle.
         half_width : int, pixel
-            Of the window around it, which should hold all of the spot and nothing else.
+            Of the window around it, which should hold all of the image and nothing else.
         background : float, counts per pixel
             Level to subtract.
         oversampling : int
@@ -292,7 +244,7 @@ class SampledPSF:
         Raises
         ------
         InputError
-            If the window is not within the frame, or holds no spot.
+            If the window is not within the frame, or holds no source.
 
         References
         ----------
@@ -304,7 +256,8 @@ class SampledPSF:
         >>> model = bf.ForwardModel(
         ...     bf.Detector((65, 65)), bf.SourceCatalog([0.3], [-0.2], [1e4]), bf.GaussianPSF(2.0),
         ...     bf.PolynomialDistortion.mirrored())
-        >>> psf = bf.SampledPSF.measured(model.expected_counts([0.0] * 12, 7.0), (0.3, -0.2), 14, background=7.0)
+        >>> frame = model.expected_counts([0.0] * 12, 7.0)
+        >>> psf = bf.SampledPSF.measured(frame, (0.3, -0.2), 14, background=7.0)
         >>> psf.values.shape, round(float(psf.density(0.0, 0.0) / model.psf.peak), 4)
         ((109, 109), 1.0)
         """
@@ -316,13 +269,13 @@ class SampledPSF:
                 f"psf: got half_width {half_width} and oversampling {oversampling}, expected both "
                 "at least 1"
             )
-        reach = math.floor(
+        most = math.floor(
             (half_width - 0.5) * oversampling
         )  # so that no sample lies outside of the window
         matrices, window = [], []
         for centre, size in zip(position, frame.shape[::-1], strict=True):
-            place = centre + 0.5 * (size - 1)
-            first = round(place) - half_width if math.isfinite(place) else -1
+            middle = centre + 0.5 * (size - 1)
+            first = round(middle) - half_width if math.isfinite(middle) else -1
             if not 0 <= first <= size - 2 * half_width - 1:
                 raise InputError(
                     f"psf: position: got {tuple(position)} with half_width {half_width}, expected "
@@ -330,13 +283,13 @@ class SampledPSF:
                     f"{frame.shape[1]} x {frame.shape[0]} pixels from its middle"
                 )
             n = 2 * half_width + 1
-            samples = place + np.arange(-reach, reach + 1) / oversampling
+            samples = middle + np.arange(-most, most + 1) / oversampling
             matrices.append(
                 special.diric(2.0 * np.pi / n * (samples[:, None] - np.arange(first, first + n)), n)
             )
             window.append(slice(first, first + n))
-        spot = frame[window[1], window[0]] - background
-        return cls(matrices[1] @ spot @ matrices[0].T, oversampling)
+        image = frame[window[1], window[0]] - background
+        return cls(matrices[1] @ image @ matrices[0].T, oversampling)
 
     @cached_property
     def _spline(self) -> Floats:
@@ -360,17 +313,17 @@ class SampledPSF:
 
     @property
     def core(self) -> tuple[float, float]:
-        """Arguments of `Detector.quadrature`: the width, pixel, and an exponent of wings that few PSFs exceed."""
+        """See `PSF`; few PSFs have wings that exceed these."""
         return self.sigma, 3.0
 
     @property
-    def profile(self) -> Spline:
+    def profile(self) -> SplineProfile:
         """The PSF of unit width as the compiled loops need it."""
-        pitch = 1.0 / (self.oversampling * self.sigma)
-        return Spline(1.0 / pitch**2, self._spline, pitch)
+        scale = self.oversampling * self.sigma
+        return SplineProfile(scale**2, self._spline, scale)
 
-    def reach(self, tolerance: float) -> float:
-        """Distance from the middle beyond which the PSF is below `tolerance` times its peak, pixel.
+    def support_radius(self, tolerance: float) -> float:
+        """Distance from the middle beyond which p is below `tolerance` times its peak, pixel.
 
         Between samples the spline does not exceed the largest of the 4 x 4 coefficients that make
         it.
@@ -392,10 +345,10 @@ class SampledPSF:
         return np.asarray(self.oversampling**2 * values.reshape(at.shape[1:]))
 
 
-PSF = GaussianPSF | MoffatPSF | SampledPSF
-
-
 def _coefficients(values: Floats) -> Floats:
-    """Of the cubic spline through the values: along either axis (c[i - 1] + 4 c[i] + c[i + 1]) / 6 = value, with zeros outside."""
+    """Coefficients of the cubic spline through the values.
+
+    Along either axis (c[i - 1] + 4 c[i] + c[i + 1]) / 6 = value, with zeros outside.
+    """
     bands = np.array([np.full(len(values), 1.0 / 6.0), np.full(len(values), 4.0 / 6.0)])
     return np.asarray(linalg.solveh_banded(bands, linalg.solveh_banded(bands, values).T).T)

@@ -1,0 +1,147 @@
+"""The tuples that the loops over counts pass to each other."""
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba.extending import register_jitable
+
+from bayesfred._typing import Floats, Ints
+from bayesfred.imaging.kernels.contexts import Footprints, Geometry, Optics, SourceNuisances
+
+Bytes = npt.NDArray[np.uint8]
+
+MASKED = -1e300  # stands for the counts of a pixel outside the likelihood
+LIMIT = -1e299
+
+
+class Frame(NamedTuple):
+    """The counts as the loops need them.
+
+    Rows are padded to `stride`, pixels outside the likelihood are MASKED. The noise's shift is in
+    the values, and on every call in the constant background.
+    """
+
+    values: Floats  # (ny * stride,)
+    segment_pixels: Floats  # (ny * stride / SEGMENT,) how many pixels count
+    segment_sum: Floats  # of their counts
+    pixels: float
+    total: float
+    ny: int
+    nx: int
+    noise: Any  # a noise model's compiled half, see `noise_dispatch`
+    varies: bool  # whether the background is a polynomial of order > 0
+    everywhere: bool  # whether every pixel that counts is visited
+
+
+class Problem(NamedTuple):
+    """What all parameter vectors share."""
+
+    optics: Optics
+    frame: Frame
+    flux: Floats  # (s,) of the catalogue, counts
+    # None where fluxes are fixed: a type of its own, for which what profiles them is not compiled
+    free: Literal[True] | None
+
+
+class Workspace(NamedTuple):
+    """A thread's buffers."""
+
+    image: Floats  # (ny * stride,), zero between calls
+    flags: Bytes  # (ny * stride / SEGMENT,) segments that a source reaches
+    span: Ints  # (ny, 2) first and last marked segment of a row
+    score: Floats  # (ny * stride,) scratch
+    weight: Floats
+    # what profiling fills again on every call, kept because new memory costs more than its use
+    heap: Floats
+
+
+class Vectors(NamedTuple):
+    """Parameter vectors as the loops need them, one row each."""
+
+    theta: Floats  # (n, k)
+    nuisances: Floats  # (n, 5) in the order of SourceNuisances
+    background: Floats  # (n, 6) coefficients of 1, u, v, u^2, uv, v^2; u, v from -1 to 1
+
+
+class Parameters(NamedTuple):
+    """One parameter vector."""
+
+    theta: Floats
+    nuisances: SourceNuisances
+    background: Floats
+
+
+class Clusters(NamedTuple):
+    """Groups of sources whose footprints share pixels.
+
+    Group c holds members[first[c]:first[c + 1]], from top to bottom. A group's symmetric matrices,
+    a row for each template of each member, are stored row after row from the first member that
+    shares pixels with the row's own up to the diagonal. The rest stays zero in Cholesky's factor.
+    """
+
+    members: Ints
+    first: Ints
+    lead: Ints  # column at which a row's storage begins, counted within the group
+    start: Ints  # where a row's column 0 would be in the group's storage
+    begin: Ints  # where the group's storage begins in a flat array
+
+
+class Group(NamedTuple):
+    """One of the clusters, with a row of its matrices for each template of each member."""
+
+    members: Ints
+    lead: Ints
+    start: Ints
+
+
+class Touching(NamedTuple):
+    """Sources with their templates, and which of them share pixels."""
+
+    footprints: Footprints
+    boxes: Ints  # (s, 4) first row, last row + 1, first column, last column + 1
+    clusters: Clusters
+    stamps: Floats  # (templates, samples)
+
+
+class Profiled(NamedTuple):
+    """Sources whose fluxes, and shifts, are at their maximum."""
+
+    touching: Touching
+    factors: Floats  # Cholesky factors of H
+    shifts: Floats  # (s, 2) pixel
+
+
+class Rendered(NamedTuple):
+    """The sources as rendered in a workspace's image, and what derivatives need of them."""
+
+    # what profiling adds to the log-likelihood; -inf where a map folds, or the fluxes have no
+    # maximum
+    extra: float
+    geometry: Geometry
+    footprints: Footprints
+    fluxes: Floats
+    profiled: Profiled | None  # None where fluxes are fixed
+
+
+class Unreached(NamedTuple):
+    """The pixels in the likelihood that no source reaches: those of segments whose flag is 0."""
+
+    pixels: float
+    counts: float
+    flags: Bytes
+
+
+class Turns(NamedTuple):
+    """Rows that threads share, and the next one's number."""
+
+    turn: Ints
+    values: Floats
+
+
+@register_jitable
+def parameters_of(vectors, i):
+    """Row i of the parameter vectors."""
+    n = vectors.nuisances[i]
+    nuisances = SourceNuisances(n[0], n[1], n[2], n[3], n[4])
+    return Parameters(vectors.theta[i], nuisances, vectors.background[i])

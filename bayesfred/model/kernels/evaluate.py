@@ -1,0 +1,91 @@
+"""Sources rendered and compared with a frame: the log-likelihood of parameter vectors."""
+
+import math
+
+import numpy as np
+
+from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.contexts import Canvas
+from bayesfred.imaging.kernels.fastmath import take_turn
+from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, row_starts
+from bayesfred.imaging.kernels.render import add_source
+from bayesfred.model.kernels.clusters import bounding_boxes, find_clusters
+from bayesfred.model.kernels.contexts import Profiled, Rendered, Touching, parameters_of
+from bayesfred.model.kernels.extrapolate import profile_extrapolated
+from bayesfred.model.kernels.fluxes import profile
+from bayesfred.model.kernels.likelihood import clear, log_likelihood, mark, room
+
+
+@inner()
+def _fill_fluxes(problem, layout, w, parameters, fluxes, free):
+    """Add the sources to the image, their fluxes at their maximum if they are free.
+
+    Returns what profiling adds to the log-likelihood, and what the derivatives need of it.
+    """
+    o, fp = layout.optics, layout.footprints
+    if free is None:
+        canvas = Canvas(w.image, row_starts(fp, w.image.size // o.ny))
+        for s in range(fluxes.size):
+            fluxes[s] = parameters.nuisances.flux_scale * problem.flux[s]
+            add_source(layout, s, (fp.first[s], fp.first[s + 1]), fluxes[s], canvas, None)
+        return 0.0, None
+    templates = 3 if parameters.nuisances.position_scatter > 0.0 else 1
+    boxes = bounding_boxes(fp)
+    clusters = find_clusters(boxes, o.ny, templates)
+    stamps = room(w, w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
+    touching = Touching(fp, boxes, clusters, stamps)
+    profiled = Profiled(touching, np.empty(clusters.begin[-1]), np.zeros((fluxes.size, 2)))
+    return profile(problem, layout, w, parameters, profiled, fluxes), profiled
+
+
+@entry()
+def render(problem, w, parameters):
+    """Render all sources, profiling their fluxes if they are free.
+
+    Whoever uses the image clears the workspace.
+    """
+    o, nuisances = problem.optics, parameters.nuisances
+    geometry = new_geometry(o)
+    extra = 0.0
+    if not (nuisances.position_scatter >= 0.0 and locate(o, parameters.theta, nuisances, geometry)):
+        extra = -math.inf
+        geometry.rows[:] = 0
+    layout = lay_out(o, geometry, nuisances.psf_sigma)
+    mark(problem.frame, layout.footprints, w)
+    fluxes = np.empty(problem.flux.size)
+    more, profiled = _fill_fluxes(problem, layout, w, parameters, fluxes, problem.free)
+    return Rendered(extra + more, geometry, layout.footprints, fluxes, profiled)
+
+
+@inner()
+def _extrapolate(problem, w, vectors, i, extrapolated):
+    """The log-likelihood by `extrapolate.py`; NaN where that does not serve."""
+    if extrapolated is None:
+        return math.nan
+    fluxes = extrapolated.fluxes[i].copy()
+    value = profile_extrapolated(problem, w, parameters_of(vectors, i), fluxes, extrapolated)
+    clear(w)
+    return value
+
+
+@entry()
+def log_likelihoods(problem, w, vectors, extrapolated, turns):
+    """Log-likelihoods of rows into turns.values; rows where it is -inf already are left alone.
+
+    `extrapolated` is None, or fluxes near their maximum. Each row is whose turn it is: threads that
+    share `turns` share the rows, and one that is held up takes fewer.
+    """
+    out = turns.values
+    while True:
+        i = take_turn(turns.turn)
+        if i >= out.size:
+            break
+        if out[i] > -math.inf:
+            value = _extrapolate(problem, w, vectors, i, extrapolated)
+            if math.isnan(value):
+                parameters = parameters_of(vectors, i)
+                value = render(problem, w, parameters).extra
+                if value > -math.inf:
+                    value += log_likelihood(problem.frame, w, parameters.background)
+                clear(w)
+            out[i] = value

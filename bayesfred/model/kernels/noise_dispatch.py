@@ -1,0 +1,54 @@
+"""What the loops ask of a noise model, answered at compile time by its type.
+
+The compiled half of a noise model is a named tuple class. Its fields are numbers and arrays; its
+static methods are compiled into the loops. Counts n and mean mu have `Noise.shift` added. p is the
+pixel's place in the frame's padded, flattened rows. A model has
+
+    log_density(noise, n, mu, p)      log-density, up to what depends on the counts alone; MASKED
+                                      or less where mu is impossible
+    derivatives(noise, n, mu, p)      s = d log_density / d mu, W = -ds / d mu, C = -1/2 dW / d mu
+    information(noise, mu, p)         the expectation of W
+
+These see a pixel outside the likelihood, too, as one with n = mu; what they return for it is not
+used. They must not branch where a loop shall vectorise. Where the background is constant, a model
+may spare the loops the pixels that no source reaches:
+
+    unreached(noise, rest, level)     the sum of log_density over them, its derivative in the level,
+                                      and the sum of information; `rest` is an `Unreached`
+
+A model that depends on the constant background beyond the mean has
+
+    at_level(noise, level)            the model for this level, itself a noise's compiled half
+    level_derivatives(noise, pixels, level, value)
+                                      what that adds to the derivative of the log-likelihood, whose
+                                      value is given, and to the information
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from bayesfred.imaging.kernels.psf_dispatch import by_type
+
+
+def _optional(name: str, default: Callable[..., Any]) -> Callable[..., Any]:
+    return by_type(lambda family: getattr(family, name, default))
+
+
+def _same(noise, level):
+    return noise
+
+
+def _no_pixels(noise, rest, level):
+    return 0.0, 0.0, 0.0
+
+
+def _no_derivatives(noise, pixels, level, value):
+    return 0.0, 0.0
+
+
+log_density = by_type(lambda family: family.log_density)
+derivatives = by_type(lambda family: family.derivatives)
+information = by_type(lambda family: family.information)
+unreached = _optional("unreached", _no_pixels)
+at_level = _optional("at_level", _same)
+level_derivatives = _optional("level_derivatives", _no_derivatives)

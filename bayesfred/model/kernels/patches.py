@@ -1,0 +1,79 @@
+"""The pixels of a cluster, one after another: on every row all that its footprints span."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesfred._typing import Floats, Ints
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.fastmath import FAST
+from bayesfred.model.kernels.contexts import LIMIT
+from bayesfred.model.kernels.likelihood import room, stretch, weigh_run
+
+
+class Patch(NamedTuple):
+    """A cluster's pixels; its rows follow each other in the frame, the first being `top`."""
+
+    top: int
+    first: Ints  # (rows,) where a row begins in the padded frame
+    start: Ints  # (rows + 1,) and here
+    image: Floats
+    score: Floats
+    weight: Floats
+
+
+@inner()
+def new_patch(w, touching, group, at):
+    """A cluster's pixels without sources; where its footprints' rows begin goes into `at`."""
+    fp, boxes, members = touching.footprints, touching.boxes, group.members
+    pitch = w.image.size // w.span.shape[0]
+    top, bottom = boxes[members[0], 0], 0
+    for s in members:
+        bottom = max(bottom, boxes[s, 1])
+    rows = max(bottom - top, 0)
+    low, high = np.full(rows, pitch), np.zeros(rows, np.int64)
+    for s in members:
+        for i in range(fp.first[s], fp.first[s + 1]):
+            j = fp.row[i] - top
+            low[j] = min(low[j], fp.low[i])
+            high[j] = max(high[j], fp.low[i] + fp.size[i])
+    start = np.zeros(rows + 1, np.int64)
+    for j in range(rows):
+        start[j + 1] = start[j] + max(high[j] - low[j], 0)
+    for s in members:
+        for i in range(fp.first[s], fp.first[s + 1]):
+            j = fp.row[i] - top
+            at[i] = start[j] + fp.low[i] - low[j]
+    for j in range(rows):
+        low[j] += (top + j) * pitch
+    size = start[rows]
+    image = room(w, 0, size)
+    image[:] = 0.0
+    return Patch(top, low, start, image, w.score[:size], w.weight[:size])
+
+
+@inner()
+def weigh_patch(frame, noise, background, patch):
+    """Score and weight of a patch's pixels."""
+    for j in range(patch.first.size):
+        a, b = patch.start[j], patch.start[j + 1]
+        part = stretch(frame, background, patch.top + j, patch.first[j], patch.image[a:b])
+        weigh_run(noise, part, patch.score[a:b], patch.weight[a:b])
+
+
+@inner(fastmath=FAST)
+def _excess_run(part, score, weight):
+    for i in range(score.size):
+        x = part.u + part.step * i
+        counted = part.values[i] > LIMIT
+        above = part.values[i] - (part.c0 + x * (part.c1 + x * part.c2))
+        score[i], weight[i] = above if counted else 0.0, 1.0 if counted else 0.0
+
+
+@inner()
+def fill_excess(frame, background, patch):
+    """Counts less background in place of the score, and a weight of 1; both zero where masked."""
+    for j in range(patch.first.size):
+        a, b = patch.start[j], patch.start[j + 1]
+        part = stretch(frame, background, patch.top + j, patch.first[j], patch.image[a:b])
+        _excess_run(part, patch.score[a:b], patch.weight[a:b])

@@ -1,0 +1,17 @@
+"""What noise does to expected counts: one module a distribution.
+
+`protocol.py` says what a noise model is.
+"""
+
+from bayesfred.model.noise.gaussian import BackgroundNoise, GaussianNoise
+from bayesfred.model.noise.poisson import PoissonNoise
+from bayesfred.model.noise.protocol import Noise
+from bayesfred.model.noise.simulation import simulate
+
+__all__ = [
+    "BackgroundNoise",
+    "GaussianNoise",
+    "Noise",
+    "PoissonNoise",
+    "simulate",
+]
