@@ -188,7 +188,7 @@ class Posterior(TargetDensity):
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
         vector = self._vector(params)
-        if not np.isfinite(self.log_prob(vector)):
+        if not np.isfinite(self.log_prior(vector)[0]):
             return np.full(vector.size, np.nan)
         slopes = [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
         return self.likelihood.gradient(vector) + slopes
@@ -202,7 +202,7 @@ class Posterior(TargetDensity):
             Without the prior.
         """
         vector = self._vector(params)
-        if not np.isfinite(self.log_prob(vector)):
+        if not np.isfinite(self.log_prior(vector)[0]):
             return np.full((vector.size, vector.size), np.nan)
         return self.likelihood.fisher(vector)
 

@@ -5,14 +5,14 @@ changes b, hence p by p_b B and D by B_v a_u - B_u a_v. `sums.py` sums such deri
 source's pixels without making them.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.contexts import SourceNuisances
+from bayesfred.imaging.kernels.contexts import Degrees, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import (
     lay_out,
@@ -41,19 +41,64 @@ class Samples(NamedTuple):
     along_b: Floats  # P_b |D|
 
 
-class Rows(NamedTuple):
-    """Buffers for a row of a basis."""
+class Sampler(NamedTuple):
+    """What a row's samples are made of.
 
+    It is taken out of the layout once a source: every access to a tuple counts references to all
+    the arrays in it, which costs more than a short row.
+    """
+
+    psf: Any
+    inverse: float  # 1 / sigma
+    work: Floats  # the row's polynomials
+    degrees: Degrees
+
+
+@inner()
+def new_sampler(layout):
+    """The sampler of a layout's sources."""
+    o = layout.optics
+    return Sampler(o.psf, 1.0 / layout.sigma, layout.work, o.degrees)
+
+
+class PixelGrid(NamedTuple):
+    """Where pixels are: u = (column - middle_u) step, v likewise."""
+
+    middle_u: float
+    middle_v: float
+    step: float
+
+
+@inner()
+def pixel_grid(layout):
+    """The grid of a layout's frame."""
+    o = layout.optics
+    return PixelGrid(0.5 * (o.nx - 1), 0.5 * (o.ny - 1), o.step)
+
+
+class Rows(NamedTuple):
+    """What the rows of a basis share, and their buffers."""
+
+    sampler: Sampler
+    offsets: Floats  # quadrature nodes and weights of a pixel
+    weights: Floats
+    ramp: Floats
+    f: Ints  # powers of u and v of the monomials of f and g
+    g: Ints
+    is_wider: bool  # whether the width is a parameter
     out: Floats  # (monomials of f and g + 2, row)
     samples: Floats  # (9, row)
     powers: Floats  # (degree + 1, row)
 
 
 @inner()
-def new_rows(o, basis, width):
+def new_rows(layout, basis, width):
     """Room for a row of a basis."""
-    out = np.empty((basis.f.shape[0] + basis.g.shape[0] + 2, width))
-    return Rows(out, np.empty((9, width)), np.empty((len(o.degrees.ab) + 1, width)))
+    o, n = layout.optics, basis.f.shape[0] + basis.g.shape[0] + 2
+    sampler, top = new_sampler(layout), len(o.degrees.ab)
+    out, samples, powers = np.empty((n, width)), np.empty((9, width)), np.empty((top + 1, width))
+    f, g, is_wider = basis.f, basis.g, widens(basis)
+    return Rows(sampler, o.offsets, o.weights, o.ramp, f, g, is_wider, out, samples, powers)
 
 
 @inner()
@@ -123,34 +168,35 @@ def _times_absolute(a, b, d):
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def samples_row(layout, weight, template, line, samples):
-    """Sample P = weight p and what comes with it on the row that `layout.work` describes.
+def samples_row(sampler, weight, template, line, samples):
+    """Sample P = weight p and what comes with it on the row that `sampler.work` describes.
 
     Template 0 is the kernel K itself. Templates 1 and 2 are its derivatives as the source is
     shifted along a and along b, X = -p_a |D| and Y = -p_b |D|: the same with p replaced by -p_a or
     by -p_b.
     """
-    o, work, inverse = layout.optics, layout.work, 1.0 / layout.sigma
-    degrees, along_a, along_b = o.degrees, samples.along_a, samples.along_b
-    norm = weight * o.psf.norm * inverse * inverse
+    psf, inverse, work, degrees = sampler
+    along_a, along_b = samples.along_a, samples.along_b
+    norm = weight * psf.norm * inverse * inverse
     _polynomial_row(along_a, line, work[2], degrees.ab)
     _polynomial_row(along_b, line, work[3], degrees.ab)
     if template == 0:
-        _slopes_row(o.psf, inverse, norm, samples.p, along_a, along_b)
+        _slopes_row(psf, inverse, norm, samples.p, along_a, along_b)
     else:
-        _second_derivatives_row(o.psf, inverse, norm, template == 1, samples)
+        _second_derivatives_row(psf, inverse, norm, template == 1, samples)
     _polynomial_row(samples.signed, line, work[1], degrees.d)
     _times_absolute(along_a, along_b, samples.signed)
     _times_determinant(samples.p, samples.size, samples.signed)
 
 
 @nb.njit(inline="always")
-def _add_widening(out, order, samples, layout, line):
+def _add_widening(out, order, samples, sampler, line):
     """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma.
 
     P is homogeneous of degree -order in a, b and sigma.
     """
-    ra, rb, top, sigma = layout.work[2], layout.work[3], len(layout.optics.degrees.ab), layout.sigma
+    ra, rb, top = sampler.work[2], sampler.work[3], len(sampler.degrees.ab)
+    inverse = sampler.inverse
     size, along_a, along_b = samples.size, samples.along_a, samples.along_b
     ramp, t0 = line.ramp, line.t0
     for i in range(out.size):
@@ -159,7 +205,7 @@ def _add_widening(out, order, samples, layout, line):
         for m in range(top):
             a = a * t + ra[top - 1 - m]
             b = b * t + rb[top - 1 - m]
-        out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) / sigma
+        out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) * inverse
 
 
 @nb.njit(inline="always")
@@ -201,75 +247,75 @@ def _add_monomials(basis_powers, v, terms, powers, out, start):
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def basis_row(layout, basis, s, i, template, rows):
-    """Fill rows.out with the basis of a unit source s in row i of the footprints.
+def basis_row(rows, source, u_row, v_row, n, template):
+    """Fill rows.out with the basis of a unit source in n pixels from (u_row, v_row) on.
 
     rows.samples are P, P |D|, s P, P_a |D|, P_b |D|, s P b_v, -s P b_u, -s P a_v, s P a_u. For the
     templates see `samples_row`. The number comes as an np.int64: of a literal one this function
     would be compiled again.
     """
-    o, fp, work = layout.optics, layout.footprints, layout.work
-    source, n, top = one_source(layout.geometry, s), fp.size[i], len(o.degrees.ab)
+    sampler, offsets, weights, ramp, f, g, is_wider, out, buffer, powers = rows
+    work, degree, conserves = sampler.work, sampler.degrees.ab, len(sampler.degrees.d) > 0
     ra, rb, rav, rbv, slope = work[2], work[3], work[4], work[5], work[6]
-    n_f, n_g = basis.f.shape[0], basis.g.shape[0]
-    out, buffer = rows.out, rows.samples
+    n_f, n_g, top = f.shape[0], g.shape[0], len(degree)
     for k in range(out.shape[0]):
         out[k, :n] = 0.0
     order = 2.0 if template == 0 else 3.0
-    v_row = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step
-    u_row = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step
     samples = Samples(buffer[0, :n], buffer[1, :n], buffer[2, :n], buffer[3, :n], buffer[4, :n])
     signed = samples.signed
     f_u, f_v, g_u, g_v = buffer[5, :n], buffer[6, :n], buffer[7, :n], buffer[8, :n]
     row_k, row_s = out[n_f + n_g, :n], out[n_f + n_g + 1, :n]
     slope[:] = 0.0
-    for q in range(o.offsets.size):
-        v = v_row + o.offsets[q]
-        map_on_row(source, v - source.v, work, o.degrees.ab)
-        polynomial_on_row(source.d, v - source.v, 1.0, work[1], o.degrees.d)
-        for p in range(o.offsets.size):
-            u = u_row + o.offsets[p]
-            line = Line(o.ramp, u - source.u)
-            samples_row(layout, o.weights[q] * o.weights[p], template, line, samples)
-            if len(o.degrees.d) > 0:
-                _times_polynomial(f_u, signed, 1.0, line, rbv, o.degrees.ab)
-                _times_polynomial(g_u, signed, -1.0, line, rav, o.degrees.ab)
+    for q in range(offsets.size):
+        v = v_row + offsets[q]
+        map_on_row(source, v - source.v, work, degree)
+        polynomial_on_row(source.d, v - source.v, 1.0, work[1], sampler.degrees.d)
+        for p in range(offsets.size):
+            u = u_row + offsets[p]
+            line = Line(ramp, u - source.u)
+            samples_row(sampler, weights[q] * weights[p], template, line, samples)
+            if conserves:
+                _times_polynomial(f_u, signed, 1.0, line, rbv, degree)
+                _times_polynomial(g_u, signed, -1.0, line, rav, degree)
                 for m in range(top):
                     slope[m] = -(m + 1) * rb[m + 1]
-                _times_polynomial(f_v, signed, 1.0, line, slope, o.degrees.ab)
+                _times_polynomial(f_v, signed, 1.0, line, slope, degree)
                 for m in range(top):
                     slope[m] = (m + 1) * ra[m + 1]
-                _times_polynomial(g_v, signed, 1.0, line, slope, o.degrees.ab)
+                _times_polynomial(g_v, signed, 1.0, line, slope, degree)
             else:
                 buffer[5:] = 0.0
             _add_row_of(row_k, samples.size)
-            if widens(basis):
-                _add_widening(row_s, order, samples, layout, line)
-            _powers_row(rows.powers, o.ramp, u, n)
-            _add_monomials(basis.f, v, (samples.along_a, f_u, f_v), rows.powers, out, 0)
-            _add_monomials(basis.g, v, (samples.along_b, g_u, g_v), rows.powers, out, n_f)
+            if is_wider:
+                _add_widening(row_s, order, samples, sampler, line)
+            _powers_row(powers, ramp, u, n)
+            _add_monomials(f, v, (samples.along_a, f_u, f_v), powers, out, 0)
+            _add_monomials(g, v, (samples.along_b, g_u, g_v), powers, out, n_f)
 
 
 @inner(fastmath=FAST)
 def add_jacobian_rows(layout, basis, flux, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
-    fp, rows = layout.footprints, new_rows(layout.optics, basis, out.shape[2])
-    reached = layout.geometry.rows
+    rows, fp, grid = new_rows(layout, basis, out.shape[2]), layout.footprints, pixel_grid(layout)
+    begins, lows, sizes, numbers = fp.first, fp.low, fp.size, fp.row
+    factors, index, basis_rows, reached = basis.factors, basis.row, rows.out, layout.geometry.rows
     for s in range(flux.size):
         if reached[s, 0] >= last or reached[s, 1] <= first:
             continue
-        for p in range(fp.first[s], fp.first[s + 1]):
-            j, low, n = fp.row[p], fp.low[p], fp.size[p]
+        source = one_source(layout.geometry, s)
+        for p in range(begins[s], begins[s + 1]):
+            j, low, n = numbers[p], lows[p], sizes[p]
             if not first <= j < last:
                 continue
-            basis_row(layout, basis, s, p, np.int64(0), rows)
-            for k in range(basis.row.size):
-                c = flux[s] * basis.factors[s, k]
+            u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
+            basis_row(rows, source, u, v, n, np.int64(0))
+            for k in range(index.size):
+                c = flux[s] * factors[s, k]
                 if c != 0.0:
-                    source = rows.out[basis.row[k]]
+                    derivative = basis_rows[index[k]]
                     target = out[k, j - first, low : low + n]
                     for i in range(n):
-                        target[i] += c * source[i]
+                        target[i] += c * derivative[i]
 
 
 @entry()

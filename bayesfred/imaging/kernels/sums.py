@@ -13,7 +13,14 @@ from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import inner
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import one_source
-from bayesfred.imaging.kernels.jacobian import Line, Samples, samples_row, widens
+from bayesfred.imaging.kernels.jacobian import (
+    Line,
+    Samples,
+    new_sampler,
+    pixel_grid,
+    samples_row,
+    widens,
+)
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 
 
@@ -110,59 +117,68 @@ def _add_sums(basis_powers, along, first, second, out):
             out[k] += n * second[m, n - 1]
 
 
+@inner()
+def _add_moments(sums, moments, w):
+    """Add a row's moments times w^k to the sums over t^m w^k."""
+    size = sums.shape[1] - 1
+    factor = 1.0
+    for k in range(size):
+        for m in range(size):
+            sums[0, m, k] += factor * moments[0, m]
+            sums[1, m, k] += factor * moments[1, m]
+            sums[2, m, k] += factor * moments[2, m]
+        factor *= w
+
+
 @inner(fastmath=FAST, error_model="numpy")
-def _add_row(layout, source, i, template, weight, buffers):
-    """Add row i of the footprints to the sums of A, B and E; returns the sum of weight P |D|."""
-    o, fp, sums, moments = layout.optics, layout.footprints, buffers.sums, buffers.moments
-    flux = 0.0
-    n, top, buffer, work = fp.size[i], len(o.degrees.ab), buffers.samples, layout.work
-    samples = Samples(buffer[0, :n], buffer[1, :n], buffer[2, :n], buffer[3, :n], buffer[4, :n])
-    power = buffer[5, :n]
-    for q in range(o.offsets.size):
-        w = (fp.row[i] - 0.5 * (o.ny - 1)) * o.step + o.offsets[q] - source.v
-        map_on_row(source, w, work, o.degrees.ab)
-        polynomial_on_row(source.d, w, 1.0, work[1], o.degrees.d)
-        for p in range(o.offsets.size):
-            t = (fp.low[i] - 0.5 * (o.nx - 1)) * o.step + o.offsets[p] - source.u
-            line = Line(o.ramp, t)
-            samples_row(layout, o.weights[q] * o.weights[p], template, line, samples)
-            flux += _weigh_row(weight, samples)
-            power[:] = 1.0
-            for m in range(0, 2 * top, 2):
-                _two_moments(power, line, samples, moments[:, m:])
-            factor = 1.0
-            for k in range(2 * top):
-                for m in range(2 * top):
-                    sums[0, m, k] += factor * moments[0, m]
-                    sums[1, m, k] += factor * moments[1, m]
-                    sums[2, m, k] += factor * moments[2, m]
-                factor *= w
+def _sample_sums(layout, source, rows, template, weight, buffers):
+    """Fill the sums of A, B and E over these rows of the footprints; returns that of P |D|."""
+    # what the rows share is taken out of the tuples once, see `Sampler`
+    o, fp, sampler = layout.optics, layout.footprints, new_sampler(layout)
+    lows, sizes, starts, numbers = fp.low, fp.size, fp.start, fp.row
+    offsets, weights, ramp = o.offsets, o.weights, o.ramp
+    middle_u, middle_v, step = pixel_grid(layout)
+    sums, moments, buffer = buffers.sums, buffers.moments, buffers.samples
+    work, degrees, d, u, v = sampler.work, sampler.degrees, source.d, source.u, source.v
+    top, begin, flux = len(degrees.ab), starts[rows[0]], 0.0
+    sums[:] = 0.0
+    for i in range(rows[0], rows[1]):
+        n = sizes[i]
+        own = weight[starts[i] - begin : starts[i] - begin + n]
+        samples = Samples(buffer[0, :n], buffer[1, :n], buffer[2, :n], buffer[3, :n], buffer[4, :n])
+        power = buffer[5, :n]
+        for q in range(offsets.size):
+            w = (numbers[i] - middle_v) * step + offsets[q] - v
+            map_on_row(source, w, work, degrees.ab)
+            polynomial_on_row(d, w, 1.0, work[1], degrees.d)
+            for p in range(offsets.size):
+                line = Line(ramp, (lows[i] - middle_u) * step + offsets[p] - u)
+                samples_row(sampler, weights[q] * weights[p], template, line, samples)
+                flux += _weigh_row(own, samples)
+                power[:] = 1.0
+                for m in range(0, 2 * top, 2):
+                    _two_moments(power, line, samples, moments[:, m:])
+                _add_moments(sums, moments, w)
     return flux
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@inner()
 def add_basis_sums(layout, basis, s, template, weight, buffers):
     """Add to buffers.out[k] the sum over a source's pixels of weight times row k of the basis."""
-    o, fp, sums, out = layout.optics, layout.footprints, buffers.sums, buffers.out
-    source, top = one_source(layout.geometry, s), len(o.degrees.ab)
-    a, b = source.a, source.b
-    n_f, n_g = basis.f.shape[0], basis.g.shape[0]
-    begin = fp.start[fp.first[s]]
-    sums[:] = 0.0
-    flux = 0.0
-    for i in range(fp.first[s], fp.first[s + 1]):
-        own = weight[fp.start[i] - begin : fp.start[i] - begin + fp.size[i]]
-        flux += _add_row(layout, source, i, template, own, buffers)
+    sums, out, degrees = buffers.sums, buffers.out, layout.optics.degrees
+    source, first = one_source(layout.geometry, s), layout.footprints.first
+    a, b, n_f, n_g = source.a, source.b, basis.f.shape[0], basis.g.shape[0]
+    flux = _sample_sums(layout, source, (first[s], first[s + 1]), template, weight, buffers)
     out[n_f + n_g] += flux
     if widens(basis):
         wide = (2.0 if template == 0 else 3.0) * flux
-        for m in range(top + 1):
-            for i in range(top + 1):
+        for m in range(len(degrees.ab) + 1):
+            for i in range(len(degrees.ab) + 1):
                 wide += a[m, i] * sums[0, m, i] + b[m, i] * sums[1, m, i]
         out[n_f + n_g + 1] -= wide / layout.sigma
-    if len(o.degrees.d) > 0:
-        _multiply_out(sums, a, b, o.degrees.ab)
+    if len(degrees.d) > 0:
+        _multiply_out(sums, a, b, degrees.ab)
     for i in range(7):
-        _shift_sums(sums[i], source.u, source.v, o.degrees.ab)
+        _shift_sums(sums[i], source.u, source.v, degrees.ab)
     _add_sums(basis.f, sums[0], sums[3], sums[4], out[:n_f])
     _add_sums(basis.g, sums[1], sums[5], sums[6], out[n_f : n_f + n_g])

@@ -72,16 +72,17 @@ def _fill_background(frame, band, sources):
 @inner()
 def _add_products(w, band, out):
     """Add the band's J W J^T to the lower triangle."""
-    pitch = band.jacobian.shape[2]
-    for j in range(band.top, band.last):
+    jacobian, top, weights = band.jacobian, band.top, w.weight
+    pitch = jacobian.shape[2]
+    for j in range(top, band.last):
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             a, b = start * SEGMENT, stop * SEGMENT
-            weight = w.weight[j * pitch + a : j * pitch + b]
+            weight = weights[j * pitch + a : j * pitch + b]
             for k in range(out.shape[0]):
-                left = band.jacobian[k, j - band.top, a:b]
+                left = jacobian[k, j - top, a:b]
                 for m in range(k + 1):
-                    out[k, m] += dot(left, band.jacobian[m, j - band.top, a:b], weight)
+                    out[k, m] += dot(left, jacobian[m, j - top, a:b], weight)
             start, stop = next_run(w, j, stop)
 
 
@@ -89,18 +90,19 @@ def _add_products(w, band, out):
 def _add_cross(w, band, profiled, cross):
     """Add the band's products of the sources' templates and J to C^T."""
     if profiled is not None:
-        touching, pitch = profiled.touching, band.jacobian.shape[2]
+        touching, (jacobian, top, last), weights = profiled.touching, band, w.weight
         fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
-        templates = stamps.shape[0]
+        first, lows, sizes, starts = fp.first, fp.low, fp.size, fp.start
+        templates, pitch = stamps.shape[0], jacobian.shape[2]
         for s in range(boxes.shape[0]):
-            for j in range(max(band.top, boxes[s, 0]), min(band.last, boxes[s, 1])):
-                i = fp.first[s] + j - boxes[s, 0]
-                a, b = fp.low[i], fp.low[i] + fp.size[i]
-                weight = w.weight[j * pitch + a : j * pitch + b]
+            for j in range(max(top, boxes[s, 0]), min(last, boxes[s, 1])):
+                i = first[s] + j - boxes[s, 0]
+                a, b = lows[i], lows[i] + sizes[i]
+                weight = weights[j * pitch + a : j * pitch + b]
                 for t in range(templates):
-                    stamp = stamps[t, fp.start[i] : fp.start[i + 1]]
+                    stamp = stamps[t, starts[i] : starts[i + 1]]
                     for k in range(cross.shape[1]):
-                        row = band.jacobian[k, j - band.top, a:b]
+                        row = jacobian[k, j - top, a:b]
                         cross[s * templates + t, k] += dot(row, stamp, weight)
 
 

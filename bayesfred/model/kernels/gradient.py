@@ -32,9 +32,9 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Layout
-from bayesfred.imaging.kernels.geometry import new_work, row_starts
-from bayesfred.imaging.kernels.jacobian import Rows, basis_row, new_rows
+from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Geometry, Layout
+from bayesfred.imaging.kernels.geometry import new_work, one_source, row_starts
+from bayesfred.imaging.kernels.jacobian import PixelGrid, Rows, basis_row, new_rows, pixel_grid
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.clusters import (
     add_block,
@@ -76,14 +76,14 @@ class _Amplitudes(NamedTuple):
 class _Adjoint(NamedTuple):
     """What the derivative of the Laplace term is made of."""
 
-    layout: Layout
+    geometry: Geometry
+    grid: PixelGrid
     touching: Touching
     fluxes: Floats
     score: Floats
     weight: Floats
     at: Ints  # where the footprints' rows begin in the padded frame
     mixed: Floats  # the templates q = Q T
-    constants: Basis
     rows: Rows
 
 
@@ -111,15 +111,16 @@ def _fill_curve(frame, noise, w, background, curve):
 
 
 @inner()
-def _add_mixed(adjoint, s, t, column, out):
+def _add_mixed(touching, s, t, column, out):
     """Add sum_b column[b] T_b of source t, where it overlaps source s, to out, a template of s."""
-    fp, boxes, stamps = adjoint.touching.footprints, adjoint.touching.boxes, adjoint.touching.stamps
+    fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
+    firsts, lows, sizes, starts = fp.first, fp.low, fp.size, fp.start
     for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-        p = fp.first[s] + j - boxes[s, 0]
-        q = fp.first[t] + j - boxes[t, 0]
-        first = max(fp.low[p], fp.low[q])
-        last = min(fp.low[p] + fp.size[p], fp.low[q] + fp.size[q])
-        ps, qs = fp.start[p] - fp.low[p], fp.start[q] - fp.low[q]
+        p = firsts[s] + j - boxes[s, 0]
+        q = firsts[t] + j - boxes[t, 0]
+        first = max(lows[p], lows[q])
+        last = min(lows[p] + sizes[p], lows[q] + sizes[q])
+        ps, qs = starts[p] - lows[p], starts[q] - lows[q]
         for b in range(stamps.shape[0]):
             for k in range(first, last):
                 out[ps + k] += column[b] * stamps[b, qs + k]
@@ -128,21 +129,22 @@ def _add_mixed(adjoint, s, t, column, out):
 @inner()
 def _mix(adjoint, group, lower):
     """Add a cluster's q = Q T to `mixed`; returns the diagonal of Q."""
-    boxes, members, size = adjoint.touching.boxes, group.members, adjoint.mixed.shape[0]
-    diagonal, column = np.empty(group.lead.size), np.empty(group.lead.size)
-    for i in range(group.lead.size):
+    boxes, members, mixed = adjoint.touching.boxes, group.members, adjoint.mixed
+    lead, touching, size = group.lead, adjoint.touching, mixed.shape[0]
+    diagonal, column = np.empty(lead.size), np.empty(lead.size)
+    for i in range(lead.size):
         s = members[i // size]
         column[:] = 0.0
         column[i] = 1.0
         solve(lower, group, column)
         diagonal[i] = column[i]
-        for m in range(group.lead[i] // size, members.size):
+        for m in range(lead[i] // size, members.size):
             t = members[m]
             if boxes[t, 0] >= boxes[s, 1]:
                 break
             if touch(boxes, s, t):
                 own = column[m * size : (m + 1) * size]
-                _add_mixed(adjoint, s, t, own, adjoint.mixed[i % size])
+                _add_mixed(touching, s, t, own, mixed[i % size])
     return diagonal
 
 
@@ -150,19 +152,28 @@ def _mix(adjoint, group, lower):
 def _second_derivatives(adjoint, group, i, part, g):
     """Add what a source's K_xx, K_xy, K_yy, and X, Y as dK, give to its rows of e and G."""
     fp, stamps, mixed = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.mixed
-    s, out = group.members[i], adjoint.rows.out
+    rows, s, ats, score, weights = (
+        adjoint.rows,
+        group.members[i],
+        adjoint.at,
+        adjoint.score,
+        adjoint.weight,
+    )
+    out, grid, source = rows.out, adjoint.grid, one_source(adjoint.geometry, s)
+    starts, lows, sizes, numbers = fp.start, fp.low, fp.size, fp.row
     flux, pitch = adjoint.fluxes[s], out.shape[1]
     xx, xy, yy = np.empty(pitch), np.empty(pitch), np.empty(pitch)
     for p in range(fp.first[s], fp.first[s + 1]):
-        n = fp.size[p]
-        basis_row(adjoint.layout, adjoint.constants, s, p, np.int64(1), adjoint.rows)
+        n = sizes[p]
+        u, v = (lows[p] - grid.middle_u) * grid.step, (numbers[p] - grid.middle_v) * grid.step
+        basis_row(rows, source, u, v, n, np.int64(1))
         xx[:n], xy[:n] = -flux * out[0, :n], -flux * out[1, :n]
-        basis_row(adjoint.layout, adjoint.constants, s, p, np.int64(2), adjoint.rows)
+        basis_row(rows, source, u, v, n, np.int64(2))
         yy[:n] = -flux * out[1, :n]
         for k in range(n):
-            at, pixel = fp.start[p] + k, adjoint.at[p] + k
+            at, pixel = starts[p] + k, ats[p] + k
             x, y = stamps[1, at] / flux, stamps[2, at] / flux
-            r, weight = adjoint.score[pixel], adjoint.weight[pixel]
+            r, weight = score[pixel], weights[pixel]
             q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
             part[0] -= weight * (q1 * x + q2 * y)
             part[1] -= weight * (q0 * x + q1 * xx[k] + q2 * xy[k])
@@ -174,18 +185,19 @@ def _second_derivatives(adjoint, group, i, part, g):
 def _fill_part(adjoint, group, curve, h, part):
     """Add sum_p T q of a cluster's sources to h, then fill e with sum_p C h T."""
     fp, stamps, at = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.at
-    size, mixed = stamps.shape[0], adjoint.mixed
-    for s in group.members:
-        for p in range(fp.first[s], fp.first[s + 1]):
+    size, mixed, members = stamps.shape[0], adjoint.mixed, group.members
+    first, starts, sizes = fp.first, fp.start, fp.size
+    for s in members:
+        for p in range(first[s], first[s + 1]):
             for t in range(size):
-                for k in range(fp.size[p]):
-                    h[at[p] + k] += stamps[t, fp.start[p] + k] * mixed[t, fp.start[p] + k]
+                for k in range(sizes[p]):
+                    h[at[p] + k] += stamps[t, starts[p] + k] * mixed[t, starts[p] + k]
     for i in range(part.size):
-        s, t = group.members[i // size], i % size
+        s, t = members[i // size], i % size
         part[i] = 0.0
-        for p in range(fp.first[s], fp.first[s + 1]):
-            for k in range(fp.size[p]):
-                part[i] += curve[at[p] + k] * h[at[p] + k] * stamps[t, fp.start[p] + k]
+        for p in range(first[s], first[s + 1]):
+            for k in range(sizes[p]):
+                part[i] += curve[at[p] + k] * h[at[p] + k] * stamps[t, starts[p] + k]
 
 
 @inner()
@@ -206,11 +218,13 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, curve):
         return np.zeros((rendered.fluxes.size, 1)), np.empty((1, 0)), w.score, 0.0
     touching, flux, shift = profiled.touching, rendered.fluxes, profiled.shifts
     fp, clusters, stamps = touching.footprints, touching.clusters, touching.stamps
-    size, pitch, constants = stamps.shape[0], w.image.size // w.span.shape[0], _constants()
+    size, pitch = stamps.shape[0], w.image.size // w.span.shape[0]
     h, y, z = np.zeros(w.image.size), np.zeros(w.image.size), np.empty((flux.size, size))
     at, mixed = row_starts(fp, pitch), np.zeros(stamps.shape)
-    rows = new_rows(layout.optics, constants, pitch)
-    adjoint = _Adjoint(layout, touching, flux, w.score, w.weight, at, mixed, constants, rows)
+    rows = new_rows(layout, _constants(), pitch)
+    adjoint = _Adjoint(
+        layout.geometry, pixel_grid(layout), touching, flux, w.score, w.weight, at, mixed, rows
+    )
     slope = 0.0
     for c in range(clusters.first.size - 1):
         group = one_cluster(clusters, c, size)
@@ -261,15 +275,17 @@ def _add_background(frame, w, image, out):
 def _fill_weights(w, fp, a, s, t, out):
     """c_t of source s at every sample of its footprint."""
     flux, z, begin = a.fluxes[s], a.z[s, t], fp.start[fp.first[s]]
+    image, mixed, score, weight, ats = a.image, a.mixed, w.score, w.weight, a.at
     amplitude = 1.0 if t == 0 else flux
     for p in range(fp.first[s], fp.first[s + 1]):
-        q, at = fp.start[p], a.at[p]
-        for k in range(fp.size[p]):
-            out[q - begin + k] = flux * a.image[at + k] if t == 0 else 0.0
-        if a.mixed.size > 0:
-            for k in range(fp.size[p]):
-                own = z * w.score[at + k] - w.weight[at + k] * a.mixed[t, q + k]
-                out[q - begin + k] += amplitude * own
+        n, at = fp.size[p], ats[p]
+        own = out[fp.start[p] - begin : fp.start[p] - begin + n]
+        for k in range(n):
+            own[k] = flux * image[at + k] if t == 0 else 0.0
+        if mixed.size > 0:
+            template = mixed[t, fp.start[p] : fp.start[p] + n]
+            for k in range(n):
+                own[k] += amplitude * (z * score[at + k] - weight[at + k] * template[k])
 
 
 @entry()
@@ -286,9 +302,10 @@ def gradient(problem, w, rendered, parameters, basis, out):
         return math.nan, np.empty((0, 0))
     fp, pitch = rendered.footprints, w.image.size // o.ny
     layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
-    curve = np.empty(w.image.size)
+    curve = np.empty(w.image.size if rendered.profiled is not None else 0)
     weigh_rows(frame, noise, w, background, 0, o.ny)
-    _fill_curve(frame, noise, w, background, curve)
+    if curve.size > 0:
+        _fill_curve(frame, noise, w, background, curve)
     scatter = parameters.nuisances.position_scatter
     z, mixed, image, slope = _laplace_adjoint(
         w, layout, rendered, rendered.profiled, scatter, curve
