@@ -1,4 +1,5 @@
-"""Slow images written from the formulas alone: every pixel, every source, one term at a time, no truncation.
+"""Slow images written from the formulas alone: every pixel, every source, one term at a time, no
+truncation.
 
 Nothing here knows the package: the tests compare the package with this. Terms are (i, j, m, n), the
 powers of x, y, u, v; a catalogue is three sequences x, y, flux; coordinates are fine pixels from
@@ -113,7 +114,8 @@ def box_counts(
     conserve_flux: bool = True,
     order: int = 7,
 ) -> FloatArray:
-    """Integrals over the recorded pixels by order x order Gauss-Legendre nodes in every fine pixel."""
+    """Integrals over the recorded pixels by order x order Gauss-Legendre nodes in every fine
+    pixel."""
     nodes = box_nodes(shape, binning, order)
     image = dense_image(f_terms, g_terms, theta, sources, sigma, nodes, conserve_flux=conserve_flux)
     weights = np.polynomial.legendre.leggauss(order)[1] / 2

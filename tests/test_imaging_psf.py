@@ -504,7 +504,8 @@ def spot(
 @pytest.mark.parametrize("sigma", [2.0, 3.0])
 @pytest.mark.parametrize("oversampling", [1, 4, 5])
 def test_measured_psf_is_the_true_one_without_noise(sigma: float, oversampling: int) -> None:
-    """Aliases of a Gaussian are below exp(-pi^2 sigma^2 / 2) of its peak, 3e-9 at sigma 2; the window's border is below 4e-8."""
+    """Aliases of a Gaussian are below exp(-pi^2 sigma^2 / 2) of its peak, 3e-9 at sigma 2; the
+    window's border is below 4e-8."""
     position, half_width = (0.37, -1.45), round(6.5 * sigma)
     psf = SampledPSF.measured(
         spot(sigma, position, 1e4, 7.0),
@@ -536,7 +537,8 @@ def test_measured_psf_is_the_true_one_without_noise(sigma: float, oversampling: 
 
 
 def test_measured_psf_s_noise_is_that_of_the_counts() -> None:
-    """Chi-square of samples one pixel apart in 100 frames, against the variances that a shift by Fourier gives them."""
+    """Chi-square of samples one pixel apart in 100 frames, against the variances that a shift by
+    Fourier gives them."""
     position, half_width, background = (0.5 + 0.37, -0.21), 15, 20.0
     mean = spot(2.0, position, 1e5, background)
     n = 2 * half_width + 1

@@ -1,4 +1,5 @@
-"""Compiled code is never older than its source: an edited kernel changes what all its callers compute."""
+"""Compiled code is never older than its source: an edited kernel changes what all its callers
+compute."""
 
 import os
 import shutil
@@ -39,7 +40,8 @@ def position(package: Path, *arguments: str, program: str = RUN) -> float:
 
 @pytest.mark.parametrize("arguments", [(), ("numba alone",)])
 def test_an_edited_kernel_is_compiled_again(tmp_path: Path, arguments: tuple[str, ...]) -> None:
-    """Negative control: with numba's own cache the edit goes unnoticed in the module that calls the kernel."""
+    """Negative control: with numba's own cache the edit goes unnoticed in the module that calls the
+    kernel."""
     package = tmp_path / "bayesfred"
     shutil.copytree(
         Path(bayesfred.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")

@@ -1,4 +1,5 @@
-"""Noise and the log-posterior against scipy and dense images; the frames that all tests of inference use."""
+"""Noise and the log-posterior against scipy and dense images; the frames that all tests of
+inference use."""
 
 import math
 import queue
@@ -58,7 +59,8 @@ def make_model(
 def make_truth(
     model: ForwardModel, rng: np.random.Generator, background: float = 3.0
 ) -> dict[str, float]:
-    """Values of all parameters that there are; every distortion term moves a corner star by about half a pixel."""
+    """Values of all parameters that there are; every distortion term moves a corner star by about
+    half a pixel."""
     ny, nx = model.detector.fine_shape
     terms = (*model.distortion.f_terms, *model.distortion.g_terms)
     levers = [(nx / 2) ** (i + m) * (ny / 2) ** (j + n) for i, j, m, n in terms]
@@ -85,7 +87,8 @@ def known(truth: Mapping[str, float], nuisances: Nuisances) -> dict[str, float]:
 def dense_image(
     model: ForwardModel, named: Mapping[str, float], fluxes: Floats | None = None, order: int = 7
 ) -> Floats:
-    """The sources' image from the formulas; the pointing offset is a constant term of f and g with a minus."""
+    """The sources' image from the formulas; the pointing offset is a constant term of f and g with
+    a minus."""
     d, detector, constant = model.distortion, model.detector, (0, 0, 0, 0)
     theta = [named[name] for name in d.names]
     f = [*theta[: len(d.f_terms)], -named.get("offset_x", 0.0)]
@@ -306,7 +309,8 @@ def test_threads_that_take_turns_miss_and_repeat_none() -> None:
 
 
 def dense_log_prob(posterior: Posterior, params: Floats, order: int = 7) -> tuple[float, float]:
-    """The log-posterior summed pixel by pixel, and the sum of its terms' sizes: the rounding's scale."""
+    """The log-posterior summed pixel by pixel, and the sum of its terms' sizes: the rounding's
+    scale."""
     named = dict(zip(posterior.parameter_names, params, strict=True))
     background = background_image(posterior.model.detector.shape, named)
     mean = dense_image(posterior.model, named, order=order) + background

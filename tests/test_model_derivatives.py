@@ -1,4 +1,5 @@
-"""Gradient, Fisher information and free fluxes against finite differences, quadrature and scipy's optimisers."""
+"""Gradient, Fisher information and free fluxes against finite differences, quadrature and scipy's
+optimisers."""
 
 import math
 from collections.abc import Callable
@@ -50,7 +51,8 @@ def overlapping(flux: float = 4e3, **options: Any) -> ForwardModel:
 
 
 def isolated(flux: float = 4e3) -> ForwardModel:
-    """Four sources 34 pixels apart, cut at 1e-14 of the peak, 8 sigma = 12 pixels: their windows do not touch."""
+    """Four sources 34 pixels apart, cut at 1e-14 of the peak, 8 sigma = 12 pixels: their windows do
+    not touch."""
     grid = SourceCatalog.grid(2, 34.0, flux)
     return make_model(grid, sigma=1.5, tolerance=1e-14, detector=Detector((64, 80)))
 
@@ -141,7 +143,8 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
 
 
 def full_information(posterior: Posterior, params: Floats, fluxes: Floats | None) -> Floats:
-    """J^T diag(1 / variance) J from dense images; with fluxes, these are further parameters with the prior's 1 / F^2."""
+    """J^T diag(1 / variance) J from dense images; with fluxes, these are further parameters with
+    the prior's 1 / F^2."""
     model, shape = posterior.model, posterior.model.detector.shape
     order = model.detector.quadrature(model.psf.sigma)[0].size
 
@@ -350,7 +353,8 @@ def test_profiled_fluxes_are_found_in_any_frame(trouble: str) -> None:
 
 
 def quadrature(posterior: Posterior, params: Floats) -> float:
-    """Log of the integral of the joint density over all fluxes, by the trapezoidal rule over +-10 errors."""
+    """Log of the integral of the joint density over all fluxes, by the trapezoidal rule over +-10
+    errors."""
     stamps, level = parts(posterior, params)
     best = posterior.fluxes(params)
     counts = posterior.counts[posterior.mask]

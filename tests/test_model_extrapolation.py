@@ -1,4 +1,5 @@
-"""Free fluxes extrapolated from other parameters: the likelihood is the one that is searched for from nothing."""
+"""Free fluxes extrapolated from other parameters: the likelihood is the one that is searched for
+from nothing."""
 
 import copy
 import pickle

@@ -1,4 +1,5 @@
-"""Sources off their catalogue positions: the profiled shifts against dense images, closed forms and refits of simulated data."""
+"""Sources off their catalogue positions: the profiled shifts against dense images, closed forms and
+refits of simulated data."""
 
 import math
 from typing import Any
@@ -27,7 +28,8 @@ SCATTER = Nuisances("free", offset=True, psf_sigma=True, background_order=1, pos
 
 
 def shifted_image(model: ForwardModel, named: dict[str, float], s: int, shift: Floats) -> Floats:
-    """Source s at unit flux, moved by `shift` as imaged: another offset, for the distortion is the catalogue position's."""
+    """Source s at unit flux, moved by `shift` as imaged: another offset, for the distortion is the
+    catalogue position's."""
     moved = {
         **named,
         "offset_x": named.get("offset_x", 0.0) + shift[0],
@@ -44,7 +46,8 @@ def scattered(
     noise: Noise = PoissonNoise(),
     **options: Any,
 ) -> tuple[Posterior, dict[str, float]]:
-    """The posterior given a frame whose sources scatter by tau about the catalogue, and the true parameters."""
+    """The posterior given a frame whose sources scatter by tau about the catalogue, and the true
+    parameters."""
     named = known({**make_truth(model, rng, background), "position_scatter": tau}, SCATTER)
     shifts = tau * rng.standard_normal((len(model.sources), 2))
     images = [
@@ -206,7 +209,8 @@ FRAMES = 24
 
 
 def test_errors_hold_where_positions_scatter() -> None:
-    """Refits of simulated frames: 25 sources whose positions scatter by five times what photon noise does to them."""
+    """Refits of simulated frames: 25 sources whose positions scatter by five times what photon
+    noise does to them."""
     rng = np.random.default_rng(53)
     terms = PolynomialDistortion(
         [(1, 0, 0, 0), (3, 0, 0, 0), (1, 2, 0, 0)], [(0, 1, 0, 0), (2, 1, 0, 0), (0, 3, 0, 0)]

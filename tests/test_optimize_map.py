@@ -1,4 +1,5 @@
-"""Priors against scipy; the posterior's maximum and its covariance against refits, grids and scipy's least squares."""
+"""Priors against scipy; the posterior's maximum and its covariance against refits, grids and
+scipy's least squares."""
 
 import io
 import math
@@ -347,7 +348,8 @@ def test_start_has_density(level: float) -> None:
 
 
 def test_a_frame_without_background_is_fitted_and_sampled(tmp_path: Path) -> None:
-    """Its background's posterior is an exponential distribution, whose rate is how much of the frame no source outshines."""
+    """Its background's posterior is an exponential distribution, whose rate is how much of the
+    frame no source outshines."""
     sources = SourceCatalog([-5.0, -5.0, 5.0, 5.0], [-5.5, 4.5, -5.5, 4.5], np.full(4, 5e3))
     distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
     model = ForwardModel(Detector((24, 24)), sources, GaussianPSF(1.5), distortion)
@@ -368,7 +370,8 @@ def test_a_frame_without_background_is_fitted_and_sampled(tmp_path: Path) -> Non
 
 
 def test_a_background_at_zero_gives_finite_numbers() -> None:
-    """Pixels between a source's reach and a segment's end have no expected counts then, and are in the likelihood."""
+    """Pixels between a source's reach and a segment's end have no expected counts then, and are in
+    the likelihood."""
     sources = SourceCatalog([-5.0, -5.0, 5.0, 5.0], [-5.5, 4.5, -5.5, 4.5], np.full(4, 5e3))
     model = ForwardModel(
         Detector((24, 24)),

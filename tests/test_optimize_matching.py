@@ -1,4 +1,5 @@
-"""Starts from counts alone: peaks, matching outward, growing disks; and what `find_map` says about where it ended."""
+"""Starts from counts alone: peaks, matching outward, growing disks; and what `find_map` says about
+where it ended."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,7 +57,8 @@ def lens(model: ForwardModel, moved: float) -> Floats:
 
 
 def bent(model: ForwardModel, moved: float) -> Floats:
-    """Coefficients of PINHOLE that shift stars along x by up to so many pixels and shear them along y."""
+    """Coefficients of PINHOLE that shift stars along x by up to so many pixels and shear them along
+    y."""
     theta = np.zeros(8)
     theta[[0, 4]] = np.array([-0.8, 0.8]) * moved / model.sources.x.max() ** 2
     return theta
@@ -124,7 +126,8 @@ def test_missing_and_spurious_peaks_do_not_bend_the_match(moved: float) -> None:
 
 
 def test_nearest_neighbours_alone_fail_where_stars_move_by_more_than_their_spacing() -> None:
-    """The negative control of the next test: without going outward the same least squares is lost."""
+    """The negative control of the next test: without going outward the same least squares is
+    lost."""
     model = grid(distortion=PINHOLE)
     truth = bent(model, 30.0)
     posterior = Posterior(model, simulate(model, truth, 2.0, seed=3))
@@ -164,7 +167,8 @@ def test_distortions_that_the_prior_holds_for_unlikely_are_found() -> None:
 
 
 def test_an_unknown_pointing_is_found_on_a_grid() -> None:
-    """Pointings that differ by the grid's spacing put most stars on peaks; only the right one puts all of them there."""
+    """Pointings that differ by the grid's spacing put most stars on peaks; only the right one puts
+    all of them there."""
     model = grid()
     truth = lens(model, 20.0)
     counts = np.roll(simulate(model, truth, 2.0, seed=3), (-7, 12), axis=(0, 1))
@@ -182,8 +186,11 @@ def test_blends_of_unequal_stars_with_some_missing_and_some_spurious() -> None:
     flux = 5e3 * rng.lognormal(0.0, 1.0, 80)
     here = rng.random(80) > 0.1
     model = ForwardModel(Detector((221, 221)), SourceCatalog(x, y, flux), GaussianPSF(2.0), PINHOLE)
-    spots = SourceCatalog(np.append(x[here], rng.uniform(-80, 80, 8)), np.append(y[here], rng.uniform(-80, 80, 8)),
-                          np.append(flux[here], rng.choice(flux, 8)))  # fmt: skip
+    spots = SourceCatalog(
+        np.append(x[here], rng.uniform(-80, 80, 8)),
+        np.append(y[here], rng.uniform(-80, 80, 8)),
+        np.append(flux[here], rng.choice(flux, 8)),
+    )
     frame = simulate(
         ForwardModel(model.detector, spots, model.psf, PINHOLE), bent(model, 20.0), 2.0, seed=12
     )
@@ -201,8 +208,14 @@ def test_blends_of_unequal_stars_with_some_missing_and_some_spurious() -> None:
 # --- peaks ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("sigma", "detector"), [(2.0, Detector((181, 181))), (9.0, Detector((181, 181))),
-                                                 (3.0, Detector((60, 61), 3, "box"))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("sigma", "detector"),
+    [
+        (2.0, Detector((181, 181))),
+        (9.0, Detector((181, 181))),
+        (3.0, Detector((60, 61), 3, "box")),
+    ],
+)
 def test_peaks_stand_where_stars_are_imaged(sigma: float, detector: Detector) -> None:
     sources = SourceCatalog([-50.3, 20.7, 60.1, 4.4], [-40.2, -35.6, 50.9, 44.3], [2e4] * 4)
     model = ForwardModel(detector, sources, GaussianPSF(sigma), CUBIC)
@@ -275,7 +288,8 @@ def test_a_search_that_ends_at_no_maximum_is_restarted(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("conserve_flux", [True, False])
 def test_a_second_image_in_the_frame_is_outside_the_prior(conserve_flux: bool) -> None:
-    """u - x + c x u^2 = 0 has a second root, where D < 0, at u = -46 for x = 40 and c = 1e-3, and at -285 for c = 1e-4."""
+    """u - x + c x u^2 = 0 has a second root, where D < 0, at u = -46 for x = 40 and c = 1e-3, and
+    at -285 for c = 1e-4."""
     distortion = PolynomialDistortion([(1, 0, 2, 0)], [])
     for x, half, c, folds in [
         (40.0, 60, 1e-3, True),
@@ -362,7 +376,8 @@ def test_overlapping_stars_are_found() -> None:
 
 
 def test_logarithmic_distortion_is_followed() -> None:
-    """A distortion outside the model: corner stars move by 1.1 spacings, and the polynomial follows to a part of the PSF."""
+    """A distortion outside the model: corner stars move by 1.1 spacings, and the polynomial follows
+    to a part of the PSF."""
     detector, sources, psf = (
         Detector((253, 253)),
         SourceCatalog.grid(9, 25.0, 2e4),
@@ -393,7 +408,8 @@ FIGURE_2C = [
 def test_the_papers_logarithmic_frame_is_fitted(
     name: str, distortion: PolynomialDistortion, record_property: Callable[[str, object], None]
 ) -> None:
-    """Fig. 2c: corner stars move by 60 pixels, spacing 50. The paper's V, of frames of unit flux, is 2.8e-3."""
+    """Fig. 2c: corner stars move by 60 pixels, spacing 50. The paper's V, of frames of unit flux,
+    is 2.8e-3."""
     detector, sources, psf = (
         Detector((505, 505)),
         SourceCatalog.grid(9, 50.0, 1e5),
@@ -438,7 +454,8 @@ def test_a_psf_wider_than_the_frame_leaves_no_peaks() -> None:
 
 
 def test_peaks_along_a_ridge_have_a_place() -> None:
-    """A bright row, as a faulty detector reads out: no column of it is higher than its neighbours."""
+    """A bright row, as a faulty detector reads out: no column of it is higher than its
+    neighbours."""
     model = grid(side=3)
     counts = np.ones(model.detector.shape)
     counts[60] = 3e6
@@ -448,7 +465,8 @@ def test_peaks_along_a_ridge_have_a_place() -> None:
 
 
 def test_consistent_frames_are_called_so() -> None:
-    """The deviance of true models is within 5 standard deviations of its expectation, at 0.05 counts a pixel too."""
+    """The deviance of true models is within 5 standard deviations of its expectation, at 0.05
+    counts a pixel too."""
     model = grid(side=5)
     for seed, level in enumerate([0.05, 0.05, 0.05, 1.0, 1.0, 30.0, 30.0]):
         assert find_map(
@@ -481,6 +499,7 @@ class Misleading(TargetDensity):
 
 
 def test_a_search_that_ends_below_its_start_is_not_followed() -> None:
-    """Neither Newton steps nor the search in their place gain anything; both end where they began."""
+    """Neither Newton steps nor the search in their place gain anything; both end where they
+    began."""
     reached = maximize(Misleading(), np.array([1.0]))
     assert reached.params == 1.0 and reached.log_prob == -0.5 and reached.distance == 1.0

@@ -1,4 +1,5 @@
-"""Sigma clipping: spots of no source, and sources without a spot, are left out, and the error bars of the rest hold."""
+"""Sigma clipping: spots of no source, and sources without a spot, are left out, and the error bars
+of the rest hold."""
 
 from dataclasses import replace
 from typing import Any
@@ -35,7 +36,8 @@ def frame(
     nuisances: Nuisances = Nuisances(),
     binning: int = 1,
 ) -> tuple[Posterior, Floats, NDArray[np.int64], Floats]:
-    """A grid of 9 x 9 stars without n of them, and with n spots elsewhere: posterior, truth, stars without a spot, spots."""
+    """A grid of 9 x 9 stars without n of them, and with n spots elsewhere: posterior, truth, stars
+    without a spot, spots."""
     rng = np.random.default_rng(seed)
     sources = SourceCatalog.grid(9, spacing, FLUX)
     detector = Detector((round(11 * spacing / binning),) * 2, binning)
@@ -64,7 +66,8 @@ def frame(
 
 
 def square(truth: Floats, estimate: MapEstimate) -> float:
-    """Squared Mahalanobis distance of the truth, which is chi-square distributed where error bars hold."""
+    """Squared Mahalanobis distance of the truth, which is chi-square distributed where error bars
+    hold."""
     d = truth - estimate.params
     return float(d @ np.linalg.solve(estimate.covariance, d))
 
@@ -144,7 +147,8 @@ def test_a_faint_neighbour_of_a_bright_spot_is_not_missing() -> None:
 
 
 def test_spots_are_bent_as_the_distortion_bends_them() -> None:
-    """Near the corner of a field that makes spots a third wider there, looks with round spots leave 3.9 instead of 0.2."""
+    """Near the corner of a field that makes spots a third wider there, looks with round spots leave
+    3.9 instead of 0.2."""
     model = ForwardModel(
         Detector((201, 201)), SourceCatalog.grid(7, 25.0, 3e4), GaussianPSF(3.0), COMPLETE
     )
@@ -230,7 +234,8 @@ def test_clean_frames_are_fitted_whole() -> None:
 
 
 def test_error_bars_hold_where_a_tenth_is_missing_and_a_tenth_foreign() -> None:
-    """Ten frames: their mean chi-square per parameter has a Monte Carlo error of sqrt(2 / 470) = 0.065."""
+    """Ten frames: their mean chi-square per parameter has a Monte Carlo error of sqrt(2 / 470) =
+    0.065."""
     squares, whole = [], []
     for seed in range(10):
         posterior, truth, missing, _ = frame(seed)

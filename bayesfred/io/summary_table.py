@@ -27,4 +27,8 @@ def make_table(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Table:
     >>> make_table({"name": ["background"], "mean": [5.0]}).colnames
     ['name', 'mean']
     """
-    return Table(dict(columns))
+    table = Table(dict(columns))
+    for name in table.colnames:
+        if table[name].dtype.kind == "f":
+            table[name].info.format = ".6g"  # as printed; the numbers keep their digits
+    return table
