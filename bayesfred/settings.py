@@ -59,7 +59,7 @@ class FrameSettings(Section):
     name : str, optional
         FITS extension or HDF5 dataset.
     reject_outliers : bool
-        Whether spots of no source, and sources without a spot, are left out:
+        Whether unmatched sources and spurious detections are left out:
         `bayesfred.reject_outliers`.
     """
 

@@ -11,7 +11,7 @@ _pool: ThreadPoolExecutor | None = None
 
 
 def share(work: Callable[[], None], most: int) -> None:
-    """Do the same work in this thread and in others, at most so many in all, and wait for them.
+    """Do the same work in this thread and in others, and wait for them.
 
     Parameters
     ----------

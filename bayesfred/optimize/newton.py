@@ -69,7 +69,7 @@ def maximize(
     steps: int | None = None,
     information: Floats | None = None,
 ) -> NewtonResult:
-    """Find the maximum above a start, or make so many Newton steps towards it.
+    """Find the maximum above a start, or make a number of Newton steps towards it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Saving a run while it goes on, so that neither a kill nor an interrupt loses much of it."""
+"""Saving a run in progress, so that neither a kill nor an interrupt loses much of it."""
 
 import signal
 import threading
