@@ -326,7 +326,7 @@ def test_verify_says_what_holds(finished: tuple[Path, Output], tmp_path: Path) -
     output = invoke(tmp_path, "verify", "run.h5")
     assert output.code == 3
     assert re.search(
-        r"│ first steps +│ \d+ made again from seed 99: differ from step 1 on +│ no ", output.stdout
+        r"│ first steps +│ \d+ replayed from seed 99: differ from step 1 on +│ no ", output.stdout
     )
     assert re.search(
         r"│ log-probability +│ 1000 of \d+ draws: differ by at most 0 +│ yes ", output.stdout

@@ -180,7 +180,7 @@ def test_background_log_likelihood_equals_scipys() -> None:
 @pytest.mark.parametrize("noise", NOISES, ids=repr)
 def test_score_is_the_slope_of_the_log_likelihood(noise: Noise) -> None:
     n, background = np.array([-1.0, 0.0, 1.0, 12.0, 700.0])[:, None], 0.04
-    n = n if noise.read_noise or noise == BackgroundNoise() else np.maximum(n, 0.0)
+    n = n if noise.shift or noise == BackgroundNoise() else np.maximum(n, 0.0)
     h = 1e-3 * (MEANS + noise.shift)  # the five-point rule errs by h^4 / 30 of the fifth derivative
     ahead = [noise.log_likelihood(n, MEANS + k * h, background) for k in (-2, -1, 1, 2)]
     slope = (ahead[0] - 8 * ahead[1] + 8 * ahead[2] - ahead[3]) / (12 * h)
@@ -195,7 +195,7 @@ def test_score_has_mean_zero_and_the_fisher_weight_as_variance(noise: Noise, mea
     rate = background or mean  # of the photons that are random
     photons = np.arange(200.0)
     node, weight = np.polynomial.hermite_e.hermegauss(5)
-    counts = mean - rate + photons[:, None] + noise.read_noise * node
+    counts = mean - rate + photons[:, None] + noise.shift**0.5 * node
     probability = stats.poisson(rate).pmf(photons)[:, None] * weight / weight.sum()
     score, residual = (
         noise.score(counts, np.array(mean), background),

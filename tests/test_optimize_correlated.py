@@ -79,7 +79,7 @@ def test_what_the_frame_knows_is_not_prior_dominated(seed: int, tmp_path: Path) 
     assert result.prior_dominated == ()
     # the negative control: coefficient by coefficient the prior does decide
     assert sum(s >= INFORMATIVE for s in result.prior_sensitivity.values()) >= 5
-    assert result.converged and result.acceptance > 0.8
+    assert result.sampled_well and result.acceptance > 0.8
 
 
 def test_a_displacement_that_only_the_prior_knows_is_named(tmp_path: Path) -> None:

@@ -397,7 +397,7 @@ def test_a_full_disk_says_so_and_loses_nothing(
         threadpool_limits(1, user_api="blas"),
         pytest.raises(
             InputError,
-            match=r"cannot be written \(No space left on device\), expected room on the disk",
+            match=r"cannot be written \(No space left on device\), expected a disk with room",
         ),
     ):
         running.until(1000.0, 200, checkpoints, show=False)

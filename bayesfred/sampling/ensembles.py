@@ -87,13 +87,8 @@ def begin(
     Raises
     ------
     InputError
-        If the estimate is not one of this posterior, or there is no density around it.
+        If there is no density around the estimate.
     """
-    if np.shape(estimate.params) != (len(posterior.parameter_names),):
-        raise InputError(
-            f"estimate: got {np.size(estimate.params)} parameters, expected "
-            f"{len(posterior.parameter_names)}: find this posterior's maximum"
-        )
     move = LaplaceMove.of(posterior, estimate)
     log_prob_of = _LogProb(posterior, 0)
     states = []

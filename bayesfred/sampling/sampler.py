@@ -214,6 +214,12 @@ class Run:
         walkers: int = 32,
         steps: Sequence[Step] = (),
     ) -> None:
+        expected = len(posterior.parameter_names)
+        if np.shape(estimate.params) != (expected,):
+            raise InputError(
+                f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
+                "this posterior's maximum"
+            )
         self.posterior, self.estimate, self.seed = posterior, estimate, seed
         self.near = posterior.near(estimate.params, estimate.covariance)
         self.steps = list(steps)
