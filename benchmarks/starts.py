@@ -39,7 +39,7 @@ TERMS = {
     "paper": bf.PolynomialDistortion.paper(),
     "mirrored": bf.PolynomialDistortion.mirrored(),
     "pinhole": bf.PolynomialDistortion.pinhole(),
-    "complete(3)": bf.PolynomialDistortion.full_polynomial(3),
+    "full_polynomial(3)": bf.PolynomialDistortion.full_polynomial(3),
 }
 METHODS = ("L-BFGS-B", "SLSQP", "trust-constr")
 LARGEST_FRAME = 400
@@ -281,7 +281,7 @@ def logarithm() -> Table:
         out.add_column(head)
     for name, distortion in (
         ("mirrored", TERMS["mirrored"]),
-        ("complete(4)", bf.PolynomialDistortion.full_polynomial(4)),
+        ("full_polynomial(4)", bf.PolynomialDistortion.full_polynomial(4)),
     ):
         model = bf.ForwardModel(detector, sources, psf, distortion, conserve_flux=False)
         posterior = bf.Posterior(model, frame, noise=bf.BackgroundNoise())

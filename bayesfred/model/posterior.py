@@ -101,17 +101,7 @@ class Posterior(TargetDensity):
         )  # fmt: skip
         for name, value in zip((f.name for f in fields(self)), values, strict=True):
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "prior", self._with_defaults(dict(prior or {})))
-
-    def _with_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
-        """The given priors checked, the default ones added."""
-        unknown = sorted(set(given) - set(self.parameter_names))
-        if unknown:
-            names = ", ".join(self.parameter_names)
-            raise InputError(f"prior: got {', '.join(unknown)}, expected names among {names}")
-        for name, distribution in given.items():
-            priors.check(name, distribution)
-        return {p.name: given.get(p.name, p.prior) for p in self.parameters}
+        object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
 
     @cached_property
     def likelihood(self) -> FrameLikelihood:
@@ -239,19 +229,6 @@ class Posterior(TargetDensity):
         ------
         InputError
             If there are more or fewer parameters than the posterior has.
-
-        Examples
-        --------
-        >>> import bayesfred as bf
-        >>> model = bf.ForwardModel(
-        ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
-        ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
-        >>> counts, free = bf.simulate(model, [1e-4], 2.0, seed=1), bf.Nuisances("free")
-        >>> posterior = bf.Posterior(model, counts, nuisances=free)
-        >>> best = bf.find_map(posterior)
-        >>> near = posterior.near(best.params, best.covariance)
-        >>> bool(abs(near.log_prob(best.params) - posterior.log_prob(best.params)) < 1e-6)
-        True
         """
         close = self.likelihood.near(self._vector(params), covariance)
         if close is self.likelihood:

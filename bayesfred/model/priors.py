@@ -7,7 +7,7 @@ priors, which are weak, are in the table of `parameters`.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.special import xlogy
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.model.parameters import Parameter
 
 # log p up to a constant, d log p / dz and -d^2 log p / dz^2 in the standardised z = (x - loc) /
 # scale; s are the shape parameters.
@@ -130,3 +131,14 @@ def slope(distribution: Any, x: float) -> tuple[float, float]:
     shapes, loc, scale = _standard(distribution)
     _, first, second = DENSITIES[distribution.dist.name](np.array((x - loc) / scale), shapes)
     return float(first) / scale, float(second) / scale**2
+
+
+def with_defaults(given: Mapping[str, Any], parameters: Sequence[Parameter]) -> dict[str, Any]:
+    """The given priors, checked, and the default ones of the other parameters."""
+    names = [parameter.name for parameter in parameters]
+    if unknown := sorted(set(given) - set(names)):
+        expected = ", ".join(names)
+        raise InputError(f"prior: got {', '.join(unknown)}, expected names among {expected}")
+    for name, distribution in given.items():
+        check(name, distribution)
+    return {parameter.name: given.get(parameter.name, parameter.prior) for parameter in parameters}
