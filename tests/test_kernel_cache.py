@@ -100,3 +100,10 @@ def test_an_edited_psf_from_outside_is_compiled_again(
     family.write_text(FAMILY.replace("return math", "return 2.0 * math"), encoding="utf-8")
     value = position(package, *arguments, program=OUTSIDE)
     assert value == pytest.approx(0.5 if arguments else 1.0)
+    # without the family the same loops still run: no index of theirs names it
+    family.unlink()
+    if arguments:
+        with pytest.raises(subprocess.CalledProcessError):
+            position(package, *arguments)
+    else:
+        assert position(package) == pytest.approx(19.6, abs=1e-9)

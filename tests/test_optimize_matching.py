@@ -400,7 +400,9 @@ def test_logarithmic_distortion_is_followed() -> None:
 
 FIGURE_2C = [
     ("mirrored", MIRRORED),
-    pytest.param("full_polynomial(4)", PolynomialDistortion.full_polynomial(4), marks=pytest.mark.long),
+    pytest.param(
+        "full_polynomial(4)", PolynomialDistortion.full_polynomial(4), marks=pytest.mark.long
+    ),
 ]
 
 

@@ -7,7 +7,6 @@ arguments: the compiled halves of other PSFs and noise models.
 """
 
 import hashlib
-import secrets
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -36,13 +35,10 @@ def source_hash() -> str:
 
 
 @cache
-def _module_hash(module: str) -> str:
-    """SHA-256 of a module's source.
-
-    Without a file, as in a notebook, it is a number that no other process draws.
-    """
+def _module_hash(module: str) -> str | None:
+    """SHA-256 of a module's source; None without a file, as in a notebook."""
     path = getattr(sys.modules.get(module), "__file__", None)
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else secrets.token_hex()
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else None
 
 
 def _modules(kind: Any) -> Iterator[str]:
@@ -56,21 +52,42 @@ def _modules(kind: Any) -> Iterator[str]:
             yield from _modules(part)
 
 
+class _Index(IndexDataCacheFile):  # type: ignore[misc]
+    """The list of one function's machine codes."""
+
+    def _load_index(self) -> dict[Any, Any]:
+        try:
+            return dict(super()._load_index())
+        except Exception:  # it names classes of another version, which are gone
+            return {}
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of one function, keyed on all sources that its machine code may come from."""
+    """numba's cache of one function, keyed on all sources that its machine code may come from.
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
-        self._cache_file = IndexDataCacheFile(
-            self._cache_path, self._impl.filename_base, source_hash()
-        )
+    Code for families from outside the package has an index of its own: without their modules it
+    cannot be read. Where such a module has no file there is nothing to key on, so nothing is kept.
+    """
 
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+    def _select(self, sig: Any) -> bool:
+        """Choose the index for these argument types; False where nothing is kept."""
         outside = sorted({module for kind in sig for module in _modules(kind)})
-        return (
-            *super()._index_key(sig, codegen),
-            *((module, _module_hash(module)) for module in outside),
-        )
+        hashes = [_module_hash(module) for module in outside]
+        name = self._impl.filename_base
+        if outside:
+            text = "".join(
+                f"{module} {each}\n" for module, each in zip(outside, hashes, strict=True)
+            )
+            name += f"-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+        self._cache_file = _Index(self._cache_path, name, source_hash())
+        return None not in hashes
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        return super()._load_overload(sig, target_context) if self._select(sig) else None
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        if self._select(sig):
+            super()._save_overload(sig, data)
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:

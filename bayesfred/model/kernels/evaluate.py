@@ -42,7 +42,7 @@ def _fill_fluxes(problem, layout, w, parameters, fluxes, free):
 def render(problem, w, parameters):
     """Render all sources, profiling their fluxes if they are free.
 
-    Whoever uses the image clears the workspace.
+    The caller clears the workspace.
     """
     o, nuisances = problem.optics, parameters.nuisances
     geometry = new_geometry(o)

@@ -198,7 +198,7 @@ def _newton(visit, clusters, scale, fluxes):
 def profile_extrapolated(problem, w, parameters, fluxes, known):
     """The log-likelihood; NaN where the fluxes are too far from the maximum.
 
-    Whoever calls clears the workspace.
+    The caller clears the workspace.
     """
     o, frame, nuisances = problem.optics, problem.frame, parameters.nuisances
     geometry = new_geometry(o)

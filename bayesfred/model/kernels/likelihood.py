@@ -2,7 +2,7 @@
 
 Only pixels that a source reaches are visited one by one: `Workspace.flags` marks them in segments,
 and where the background is constant the noise model may sum up the rest. The workspace's image is
-zero between calls; whoever reads it clears it.
+zero between calls; the reader clears it.
 """
 
 import math
