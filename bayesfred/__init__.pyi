@@ -1,4 +1,4 @@
-from . import commands
+from . import commands, show
 from .analysis.comparison import Comparison, compare
 from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.noise_study import NoiseStudy, noise_study
@@ -53,5 +53,6 @@ __all__ = [
     "reject_outliers",
     "sample",
     "sampling_matrix",
+    "show",
     "simulate",
 ]

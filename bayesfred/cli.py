@@ -53,7 +53,7 @@ def demo(
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 terms, Poisson counts."""
     _run(
-        lambda: bf.commands.show_run(
+        lambda: bf.show.show_run(
             bf.commands.demo(folder, seed=seed, overwrite=overwrite, say=print)
         )
     )
@@ -62,18 +62,14 @@ def demo(
 @app.command()
 def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
     """Simulate the frame that [simulation] describes, and its source grid, if it has one."""
-    _run(
-        lambda: bf.commands.show_simulated(
-            bf.commands.simulate_frame(run_file, overwrite=overwrite)
-        )
-    )
+    _run(lambda: bf.show.show_simulated(bf.commands.simulate_frame(run_file, overwrite=overwrite)))
 
 
 @app.command(epilog="A complete run file:\n\n" + _example())
 def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
     _run(
-        lambda: bf.commands.show_run(
+        lambda: bf.show.show_run(
             bf.commands.fit(run_file, resume=resume, overwrite=overwrite, say=print)
         )
     )
@@ -107,7 +103,7 @@ def study(
 ) -> None:
     """Fit many simulated frames: how well can a distortion be known, and do error bars hold."""
     _run(
-        lambda: bf.commands.show_study(
+        lambda: bf.show.show_study(
             bf.commands.study(
                 run_file,
                 kind=kind and kind.value,
@@ -132,7 +128,7 @@ def report(
     ] = None,
 ) -> None:
     """Judge a chain file again and write its report, .html and .png, beside it."""
-    _run(lambda: bf.commands.show_run(bf.commands.report(chain_file, target_ess=target_ess)))
+    _run(lambda: bf.show.show_run(bf.commands.report(chain_file, target_ess=target_ess)))
 
 
 @app.command()
@@ -143,7 +139,7 @@ def compare(
     ],
 ) -> None:
     """Rank models of one frame by how well they predict every pixel from the others."""
-    _run(lambda: bf.commands.show_comparison(bf.commands.compare(chain_files)))
+    _run(lambda: bf.show.show_comparison(bf.commands.compare(chain_files)))
 
 
 @app.command()
@@ -154,9 +150,7 @@ def verify(
     ] = False,
 ) -> None:
     """Compute again what a chain file holds: hashes, log-probabilities, maximum, first steps."""
-    _run(
-        lambda: bf.commands.show_verification(bf.commands.verify(chain_file, every_draw=every_draw))
-    )
+    _run(lambda: bf.show.show_verification(bf.commands.verify(chain_file, every_draw=every_draw)))
 
 
 def _run(work: "Callable[[], bool]") -> None:

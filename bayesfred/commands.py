@@ -1,19 +1,14 @@
 """Whole runs from a run file: build the posterior, fit, sample, judge, write the report.
 
 Every command returns a record and prints nothing. What should be known while it works goes to
-`say`, which is told one line at a time. The functions `show_...` print a record, as `cli.py` has
-them do, and return whether all is well.
+`say`, which is told one line at a time. `show.py` prints the records.
 """
 
 import os
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.table import Table
 
 from bayesfred import build, pipeline, settings
 from bayesfred._typing import Floats, PathLike
@@ -22,13 +17,12 @@ from bayesfred.analysis import verify as verification
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
-from bayesfred.errors import InputError, printable
+from bayesfred.errors import InputError
 from bayesfred.io import atomic, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.io.tables import TableRecord, write_table
 from bayesfred.pipeline import Result, Say, Simulated, Study, Verification
-from bayesfred.reporting import screen
 from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
@@ -322,74 +316,6 @@ def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
                 f"{name}: got it twice, expected chains of different models: name each once"
             )
     return comparison.compare({str(name): open_chain(name) for name in names})
-
-
-def show_run(result: Result) -> bool:
-    """Print what a run found; whether it is trustworthy is the last line, and what is returned."""
-    chain, diagnostics = result.chain, result.diagnostics
-    _print(screen.parameter_table(result.summary))
-    if chain.n_invalid:
-        print(
-            f"{chain.n_invalid} log-probabilities were NaN or infinite and taken as -inf: "
-            "narrower priors avoid that"
-        )
-    if diagnostics.prior_dominated:
-        print(
-            f"prior-dominated: {', '.join(diagnostics.prior_dominated)}: the frame does not "
-            "decide alone, see the report"
-        )
-    _print_files(chain=result.path, report=result.page, picture=result.picture)
-    print(diagnostics.message)
-    return diagnostics.trustworthy
-
-
-def show_simulated(simulated: Simulated) -> bool:
-    """Print which files were written."""
-    posterior = simulated.posterior
-    ny, nx = posterior.counts.shape
-    if simulated.catalogue:
-        print(f"{printable(str(simulated.catalogue))}: {len(posterior.model.sources)} sources")
-    shown = f"{ny} x {nx} pixels, {posterior.counts.sum():.0f} counts"
-    print(f"{printable(str(simulated.frame))}: {shown}")
-    return True
-
-
-def show_study(done: Study) -> bool:
-    """Print a study's findings."""
-    _print(screen.study_table(done.result))
-    _print_files(table=done.table, summary=done.summary, picture=done.picture)
-    print(done.result.message)
-    return done.holds
-
-
-def show_verification(found: Verification) -> bool:
-    """Print what holds."""
-    _print(screen.check_table(found.checks))
-    if found.other_versions:
-        print(f"made with {', '.join(found.other_versions)}")
-    return found.holds
-
-
-def show_comparison(compared: comparison.Comparison) -> bool:
-    """Print the ranking of models."""
-    _print(screen.comparison_table(compared))
-    print(
-        f"chosen: {printable(compared.chosen)}, the one with the fewest parameters that predicts "
-        "as well as the best"
-    )
-    if not compared.reliable:
-        print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
-    return compared.reliable
-
-
-def _print(table: Table) -> None:
-    # a file or a pipe has no width of its own
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
-
-
-def _print_files(**named: Path) -> None:
-    for label, path in named.items():
-        print(f"{label:8}{printable(str(path))}")
 
 
 def _no_simulation(run_file: Path) -> InputError:

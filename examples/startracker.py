@@ -41,7 +41,7 @@ def main() -> int:
         print(f"\n{name}")
         overwrite = "--overwrite" in sys.argv
         result = bf.commands.fit(run_file, overwrite=overwrite, say=print)
-        trustworthy = bf.commands.show_run(result) and trustworthy
+        trustworthy = bf.show.show_run(result) and trustworthy
         compare(run_file, result.chain)
     return 0 if trustworthy else 3
 

@@ -682,7 +682,7 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool
 
     def run(text: str, **options: Any) -> bool:
         Path("run.toml").write_text(RUN + text, encoding="utf-8")
-        return bf.commands.show_study(bf.commands.study("run.toml", **{"workers": 1, **options}))
+        return bf.show.show_study(bf.commands.study("run.toml", **{"workers": 1, **options}))
 
     return run
 
