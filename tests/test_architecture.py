@@ -18,7 +18,7 @@ import bayesfred
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "bayesfred"
 MODULES = {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
-PUBLIC = [name for name in bayesfred.__all__ if name != "commands"]
+PUBLIC = [name for name in bayesfred.__all__ if name not in ("commands", "show")]
 
 
 def long_modules(sources: dict[Path, str]) -> list[str]:
