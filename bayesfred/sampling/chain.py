@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import arviz_base
 import xarray as xr
@@ -16,7 +16,9 @@ from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.summary import summary
 
-__all__ = ["Chain"]
+__all__ = ["Chain", "Method"]
+
+Method = Literal["mcmc", "laplace"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,7 @@ class Chain:
     chain : ndarray, shape (n_ensembles, n_steps, n_walkers, d), parameter units
         Positions after every step, burn-in included.
     log_prob : ndarray, shape (n_ensembles, n_steps, n_walkers)
+        The posterior's log-density there; the approximation's where `method` is "laplace".
     accepted : ndarray, shape (n_ensembles, n_walkers)
         Number of accepted moves.
     random_states : tuple of tuple, length n_ensembles
@@ -48,6 +51,9 @@ class Chain:
         The number of effective draws that was asked for.
     n_invalid : int
         Number of log-probabilities that were NaN or +inf and were taken as -inf.
+    method : {"mcmc", "laplace"}
+        How the draws were made: by the sampler, or independently from the Laplace approximation,
+        see `laplace`.
     """
 
     path: Path | None
@@ -62,6 +68,7 @@ class Chain:
     versions: dict[str, str]
     target_ess: float = 1000.0
     n_invalid: int = 0
+    method: Method = "mcmc"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
