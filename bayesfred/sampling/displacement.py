@@ -8,7 +8,7 @@ It is solved for every draw, so that mean and covariance are those of the poster
 the displacement depends on the coefficients. `imaging.inverse` finds the roots.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +16,12 @@ import numpy.typing as npt
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.parameters import displacing
+from bayesfred.model.posterior import Posterior
 
 if TYPE_CHECKING:
     from bayesfred.sampling.chain import Chain
 
-__all__ = ["displacement"]
+__all__ = ["displacement", "frame_posterior"]
 
 # A standard deviation of this many independent draws has an error of 2.2 %, a variance of 4.5 %.
 MOST_DRAWS = 1000
@@ -52,12 +53,7 @@ def displacement(chain: "Chain", u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Fl
     InputError
         If the chain is of a density that is no frame's, or the points cannot be broadcast.
     """
-    posterior = chain.posterior()
-    if not hasattr(posterior, "model"):
-        raise InputError(
-            "chain: displacement: got draws of a density that is no frame's, expected those of a "
-            "Posterior"
-        )
+    posterior = frame_posterior(chain)
     try:
         u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     except (TypeError, ValueError):
@@ -80,3 +76,28 @@ def displacement(chain: "Chain", u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Fl
         off = found - found.mean(axis=1, keepdims=True)
         covariance[some] = np.einsum("inp,jnp->pij", off, off) / (len(draws) - 1)
     return mean.reshape(*u.shape, 2), covariance.reshape(*u.shape, 2, 2)
+
+
+def frame_posterior(chain: "Chain") -> Posterior:
+    """The posterior of a chain, if it is that of a frame.
+
+    Parameters
+    ----------
+    chain : Chain
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    InputError
+        If it is another density.
+    """
+    posterior = chain.posterior()
+    if not hasattr(posterior, "model"):
+        raise InputError(
+            "chain: displacement: got draws of a density that is no frame's, expected those of a "
+            "Posterior"
+        )
+    return cast(Posterior, posterior)
