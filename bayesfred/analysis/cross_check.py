@@ -41,7 +41,7 @@ A. Gelman, X.-L. Meng, H. Stern (1996), Statistica Sinica 6, 733: checks of a mo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,6 +189,24 @@ class CrossCheck:
         if self.holds:
             return f"the errors are right: the halves agree ({found}); {power}"
         return f"the errors are {self.verdict}: {scaling}; {found}; {power}"
+
+    def record(self) -> dict[str, Any]:
+        """The findings as numbers and texts by name, as `bayesfred crosscheck --json` prints them.
+
+        Each agreement has `p`, `chi2`, `dof`, `factor`, `factor_low`, `factor_high` and
+        `detectable`.
+        """
+        record: dict[str, Any] = {"verdict": self.verdict, "message": self.message}
+        for name, a in (("displacement", self.displacement), ("coefficients", self.coefficients)):
+            low, high = a.factor_interval
+            numbers = {
+                "p": a.p, "chi2": a.chi2, "dof": a.dof, "factor": a.factor, "factor_low": low,
+                "factor_high": high, "detectable": a.detectable,
+            }  # fmt: skip
+            record |= {f"{name}_{key}": value for key, value in numbers.items()}
+        record["displacement_rms"] = self.displacement_rms
+        record["displacement_expected"] = self.displacement_expected
+        return record
 
 
 class _Half(NamedTuple):
