@@ -1,5 +1,6 @@
 from . import commands, show
 from .analysis.comparison import Comparison, compare
+from .analysis.cross_check import CrossCheck, cross_check
 from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.noise_study import NoiseStudy, noise_study
 from .analysis.sbc import PosteriorCalibration, calibrate_posterior
@@ -25,6 +26,7 @@ __all__ = [
     "BackgroundNoise",
     "Chain",
     "Comparison",
+    "CrossCheck",
     "Detector",
     "Diagnostics",
     "ForwardModel",
@@ -47,6 +49,7 @@ __all__ = [
     "commands",
     "compare",
     "correct_sampling",
+    "cross_check",
     "diagnose",
     "find_map",
     "laplace",

@@ -143,6 +143,19 @@ def compare(
 
 
 @app.command()
+def crosscheck(
+    run_file: Run,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Fit two halves of the sources apart: are the errors too small, right or too large."""
+    _run(
+        lambda: bf.show.show_cross_check(
+            bf.commands.crosscheck(run_file, say=None if as_json else print), as_json=as_json
+        )
+    )
+
+
+@app.command()
 def verify(
     chain_file: ChainFile,
     every_draw: Annotated[

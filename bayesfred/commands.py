@@ -12,7 +12,7 @@ from typing import Any
 
 from bayesfred import build, pipeline, settings
 from bayesfred._typing import Floats, PathLike
-from bayesfred.analysis import comparison
+from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
@@ -316,6 +316,30 @@ def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
                 f"{name}: got it twice, expected chains of different models: name each once"
             )
     return comparison.compare({str(name): open_chain(name) for name in names})
+
+
+def crosscheck(run_file: PathLike, *, say: Say | None = None) -> cross_check.CrossCheck:
+    """Fit two halves of a run file's sources apart, and ask whether the errors are right.
+
+    Parameters
+    ----------
+    run_file : path-like
+    say : callable, optional
+        Told what was read, a line at a time.
+
+    Returns
+    -------
+    CrossCheck
+
+    Raises
+    ------
+    InputError
+        If the run file, the frame or the catalogue is unusable, or the sources are too few.
+    """
+    run_file = Path(run_file)
+    posterior, estimate, _ = pipeline.read_frame(settings.read_settings(run_file), run_file, say)
+    with pipeline.naming(run_file):
+        return cross_check.cross_check(posterior, estimate=estimate)
 
 
 def _no_simulation(run_file: Path) -> InputError:

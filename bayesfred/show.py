@@ -3,6 +3,7 @@
 Every function prints the record of a function in `commands.py` and returns whether all is well.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bayesfred.analysis import comparison
+from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.errors import printable
 from bayesfred.pipeline import Result, Simulated, Study, Verification
 from bayesfred.reporting import screen
@@ -71,6 +73,20 @@ def show_comparison(compared: comparison.Comparison) -> bool:
     if not compared.reliable:
         print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
     return compared.reliable
+
+
+def show_cross_check(found: CrossCheck, *, as_json: bool = False) -> bool:
+    """Print how well the halves agree, as a table and a sentence or as one JSON object."""
+    if as_json:
+        print(json.dumps(found.record()))
+        return found.holds
+    _print(screen.cross_check_table(found))
+    print(
+        f"displacements of the halves differ by {found.displacement_rms:.2g} pixel rms, expected "
+        f"{found.displacement_expected:.2g}"
+    )
+    print(found.message)
+    return found.holds
 
 
 def _print(table: Table) -> None:

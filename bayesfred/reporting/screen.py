@@ -8,13 +8,20 @@ from rich.markup import escape
 from rich.table import Table
 
 from bayesfred.analysis.comparison import Comparison
+from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import printable
 from bayesfred.reporting.labels import scale_of
 
-__all__ = ["check_table", "comparison_table", "parameter_table", "study_table"]
+__all__ = [
+    "check_table",
+    "comparison_table",
+    "cross_check_table",
+    "parameter_table",
+    "study_table",
+]
 
 
 def parameter_table(summary: Any) -> Table:
@@ -132,6 +139,27 @@ def comparison_table(compared: Comparison) -> Table:
             f"{score.p_loo:.1f}",
             "" if score is best else behind,
             f"{score.pareto_k:.2f}" if np.isfinite(score.pareto_k) else "",
+        )
+    return table
+
+
+def cross_check_table(found: CrossCheck) -> Table:
+    """Lay out how well two halves agree.
+
+    Parameters
+    ----------
+    found : CrossCheck
+
+    Returns
+    -------
+    rich.table.Table
+    """
+    table = _table("halves agree in", "chi-square", "dof", "p", "errors times", "found from")
+    for name, a in (("displacement", found.displacement), ("coefficients", found.coefficients)):
+        low, high = a.factor_interval
+        scaling = f"{a.factor:.2f} ({low:.2f} to {high:.2f})"
+        table.add_row(
+            name, f"{a.chi2:.1f}", str(a.dof), f"{a.p:.2g}", scaling, f"{a.detectable:.2f}"
         )
     return table
 

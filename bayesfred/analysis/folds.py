@@ -1,0 +1,133 @@
+"""Parts of a frame by its sources: each part covers the field, no two share a pixel.
+
+Sources are ordered along a path that visits the field in bands, to and fro, and are dealt in turn
+to the folds. On a regular grid two folds are a checkerboard. Every pixel belongs to the source
+whose light dominates there, and where no light comes to the one that is nearest by the same
+measure. For a Gaussian PSF of width s, source k dominates where |p - q_k|^2 - 2 s^2 log F_k is
+least: a power diagram, which is a search for nearest neighbours with one coordinate more.
+
+A fold's likelihood keeps the pixels of its sources. The other sources stay in the model, because
+their light reaches these pixels. So the counts of two folds are independent given the parameters.
+
+References
+----------
+F. Aurenhammer (1987), SIAM Journal on Computing 16, 78: power diagrams.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import spatial
+
+from bayesfred._typing import Flags, Floats, Ints
+from bayesfred.imaging.kernels.geometry import image_positions
+from bayesfred.model.posterior import Posterior
+
+GRID = 33  # points along each axis of the frame at which fields are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Which part of the frame sources and pixels belong to.
+
+    Attributes
+    ----------
+    sources : ndarray of int, shape (n,)
+        Fold of each source of the catalogue, from 0; -1 where no pixel of the likelihood holds its
+        image.
+    pixels : ndarray of int, shape (ny, nx)
+        Fold of each pixel; -1 where it is not in the likelihood.
+    points : ndarray, shape (m, 2), pixel
+        A grid (u, v) over the frame within the convex hull of the images, or the images themselves
+        where they are too few for a hull.
+    """
+
+    sources: Ints
+    pixels: Ints
+    points: Floats
+
+    def without(self, posterior: Posterior, fold: int) -> Posterior:
+        """The posterior without the pixels of a fold."""
+        return _masked(posterior, (self.pixels >= 0) & (self.pixels != fold))
+
+    def only(self, posterior: Posterior, fold: int) -> Posterior:
+        """The posterior of the pixels of one fold."""
+        return _masked(posterior, self.pixels == fold)
+
+
+def fold_sources(posterior: Posterior, params: Floats, number: int) -> Folds:
+    """Deal the sources to folds, and give each fold its pixels.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+        Where the images stand.
+    number : int
+        Folds; some are empty where there are fewer sources.
+
+    Returns
+    -------
+    Folds
+    """
+    positions = _positions(posterior, params)
+    ny, nx = posterior.model.detector.shape
+    step = posterior.model.detector.binning
+    pixel = np.rint(positions / step + 0.5 * (np.array([nx, ny]) - 1.0)).astype(int)
+    column, row = np.clip(pixel, 0, [nx - 1, ny - 1]).T
+    seen = np.all(pixel == np.stack([column, row], axis=1), axis=1)
+    seen &= posterior.mask[row, column]
+    there = np.flatnonzero(seen)
+    sources = np.full(seen.size, -1)
+    sources[there[_path(positions[there])]] = np.arange(there.size) % number
+    pixels = np.full((ny, nx), -1)
+    if there.size:
+        owner = _owners(posterior, params, positions[there], posterior.fluxes(params)[there])
+        pixels[posterior.mask] = sources[there][owner]
+    return Folds(sources, pixels, _field_points(posterior, positions[there]))
+
+
+def _masked(posterior: Posterior, mask: Flags) -> Posterior:
+    return replace(posterior, mask=mask, extrapolation=None)
+
+
+def _positions(posterior: Posterior, params: Floats) -> Floats:
+    """Image positions (u, v) of the sources, shape (n, 2), fine pixel."""
+    model = posterior.model
+    known = dict(zip(posterior.parameter_names, params, strict=True))
+    theta = model.polynomial.monomial_coefficients(params[: model.distortion.n_terms].copy())
+    offset = [known.get(name, 0.0) for name in ("offset_x", "offset_y")]
+    return np.asarray(image_positions(model.optics(), theta, *offset, model.psf.sigma))
+
+
+def _path(positions: Floats) -> Ints:
+    """The order of points along bands of v, to and fro in u."""
+    n = len(positions)
+    bands = max(1, round(np.sqrt(n)))
+    band = np.empty(n, dtype=int)
+    band[np.argsort(positions[:, 1], kind="stable")] = np.arange(n) * bands // max(n, 1)
+    across = np.where(band % 2, -positions[:, 0], positions[:, 0])
+    return np.lexsort([across, band])
+
+
+def _owners(posterior: Posterior, params: Floats, positions: Floats, flux: Floats) -> Ints:
+    """The dominant source of every pixel of the likelihood."""
+    known = dict(zip(posterior.parameter_names, params, strict=True))
+    width = known.get("psf_sigma", posterior.model.psf.sigma)
+    lead = np.log(flux / flux.max())
+    lifted = np.column_stack([positions, width * np.sqrt(-2.0 * lead)])
+    u, v = posterior.model.detector.pixel_centres()
+    row, column = np.nonzero(posterior.mask)
+    pixels = np.column_stack([u[column], v[row], np.zeros(row.size)])
+    return np.asarray(spatial.cKDTree(lifted).query(pixels)[1])
+
+
+def _field_points(posterior: Posterior, positions: Floats) -> Floats:
+    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
+    axes = np.meshgrid(*(np.linspace(-h, h, GRID) for h in half))
+    grid = np.stack([axis.ravel() for axis in axes], axis=1)
+    try:
+        inside = spatial.Delaunay(positions).find_simplex(grid) >= 0
+    except (ValueError, spatial.QhullError):  # no point, or all on a line
+        return positions
+    return grid[inside] if inside.any() else positions
