@@ -354,9 +354,11 @@ class Polynomial:
 
         Parameters
         ----------
-        theta, offset
+        theta
             As for `image_position`.
         u, v : ndarray, shape (points,), pixel
+        offset
+            As for `image_position`.
 
         Returns
         -------
