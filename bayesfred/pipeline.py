@@ -23,13 +23,17 @@ from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import reject_outliers
+from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
-from bayesfred.reporting.html import page_figures, write_report
-from bayesfred.reporting.posteriors import overview
+from bayesfred.reporting.html import write_report
+from bayesfred.reporting.posteriors import corner_parameters, overview
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import open_chain
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import sample, searching
 from bayesfred.sampling.summary import summary
+from bayesfred.sections import toml
 
 __all__ = [
     "Job",
@@ -41,6 +45,7 @@ __all__ = [
     "beside",
     "fit_frame",
     "make_folder",
+    "may_write_page",
     "naming",
     "read_frame",
     "write_results",
@@ -265,10 +270,11 @@ def fit_frame(
     resume = paths.may_write(output, overwrite=overwrite, resume=resume, beside=others)
     try:
         with naming(job.run_file):
+            record = _record(job, open_chain(output) if resume else None)
             chain = sample(
                 posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles,
                 walkers=s.walkers, target_ess=s.target_ess, steps=s.steps, resume=resume,
-                overwrite=overwrite, progress=say is not None,
+                overwrite=overwrite, progress=say is not None, record=record,
             )  # fmt: skip
     except OSError as error:
         raise InputError(
@@ -277,21 +283,41 @@ def fit_frame(
         ) from error
     if say:
         say(f"maximum: {chain.estimate.message}")
-    return write_results(chain, output, job, target_ess=s.target_ess)
+    return write_results(chain, output, output, target_ess=s.target_ess)
 
 
-def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_ess: float) -> Result:
-    """Judge a chain, and write page and picture beside it.
+def _record(job: Job, before: Chain | None) -> RunRecord:
+    """What the chain keeps of a run; a resumed one has the seed and ensembles of its beginning."""
+    run = job.run
+    if before is not None:
+        ensembles, _, walkers, _ = before.chain.shape
+        used = {"seed": before.seed, "ensembles": ensembles, "walkers": walkers}
+        run = run.model_copy(update={"sampling": run.sampling.model_copy(update=used)})
+    return RunRecord(
+        printable(job.run_file.stem),
+        printable(Path(run.frame.path).name) if job.truth is None else "simulated frame",
+        toml(run),
+        tuple(job.notes),
+        job.truth,
+    )
+
+
+def write_results(
+    chain: Chain, path: Path, page: Path, *, target_ess: float, corner: Sequence[str] = ()
+) -> Result:
+    """Judge a chain, and write its page and picture.
 
     Parameters
     ----------
     chain : Chain
     path : Path
         The chain's file.
-    job : Job, optional
-        The run that made the chain, if it is known.
+    page : Path
+        A file with the page's name but for the suffix.
     target_ess : float
         Effective draws to ask of every parameter.
+    corner : sequence of str, optional
+        Parameters to show in pairs; by default chosen.
 
     Returns
     -------
@@ -300,33 +326,32 @@ def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_es
     Raises
     ------
     InputError
-        If page or picture cannot be written.
+        If page or picture cannot be written, or `corner` names what is no parameter.
     """
-    posterior, truth = chain.posterior(), job.truth if job else None
+    posterior = chain.posterior()
+    truth = chain.record.truth if chain.record else None
+    shown = corner_parameters(chain.draws(), chain.parameter_names, corner)
     diagnostics = diagnose(chain, target_ess=target_ess)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
-    page, picture = beside(path)
+    page, picture = beside(page)
     write_report(
         page,
-        title=printable((job.run_file if job else path).stem),
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
-        figures=page_figures(fitted, chain, truth=truth),
-        notes=job.notes if job else (),
-        settings=job.run.model_dump_json(indent=2) if job else None,
+        figures=page_figures(fitted, chain, diagnostics, shown=shown, truth=truth),
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
     return Result(chain, diagnostics, table, path, page, picture)
 
 
-def beside(chain: Path) -> tuple[Path, Path]:
-    """Name the page and the picture of a chain file.
+def beside(path: Path) -> tuple[Path, Path]:
+    """Name the page and the picture of a chain file, or the picture of a page.
 
     Parameters
     ----------
-    chain : Path
+    path : Path
 
     Returns
     -------
@@ -337,7 +362,39 @@ def beside(chain: Path) -> tuple[Path, Path]:
     >>> [path.name for path in beside(Path("run.h5"))]
     ['run.html', 'run.png']
     """
-    return chain.with_suffix(".html"), chain.with_suffix(".png")
+    return path.with_suffix(".html"), path.with_suffix(".png")
+
+
+def may_write_page(page: Path, *others: Path, inputs: Sequence[Path], overwrite: bool) -> None:
+    """Refuse a page that nobody asked to replace, or that cannot be written where it should go.
+
+    Parameters
+    ----------
+    page : Path
+    *others : Path
+        Files that are written with it.
+    inputs : sequence of Path
+        Chain files that it is made of.
+    overwrite : bool
+        Whether page and others may be replaced.
+
+    Raises
+    ------
+    InputError
+        If a file exists, the page is not called NAME.html, its folder is missing, or a chain would
+        be replaced.
+    """
+    for path in inputs:
+        if any(os.path.abspath(path) == os.path.abspath(place) for place in (page, *others)):
+            raise InputError(
+                f"{path}: got a chain named as its report, which would replace it, expected "
+                "NAME.h5: rename it"
+            )
+    if page.suffix != ".html":
+        raise InputError(f"{page}: got a page with another suffix, expected NAME.html")
+    if not page.parent.is_dir():
+        raise InputError(f"{page}: no folder {page.parent}, expected one to write to: create it")
+    paths.may_write(page, overwrite=overwrite, beside=others)
 
 
 def make_folder(path: Path) -> None:
