@@ -18,7 +18,7 @@ from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
-from bayesfred.io import atomic, paths
+from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.io.tables import TableRecord, write_table
@@ -63,7 +63,7 @@ def demo(
         If the folder cannot be created, or holds a demo already.
     """
     output = Path(folder, "demo.h5")
-    pipeline.make_folder(output)
+    outputs.make_folder(output)
     example = Path(__file__).with_name("example.toml")
     run = settings.read_settings(example)
     seeded = {key: getattr(run, key).model_copy(update={"seed": seed}) for key in _SEEDED}
@@ -153,7 +153,7 @@ def fit(
         )
     posterior, estimate, notes = pipeline.read_frame(run, run_file, say)
     if run.output.path is None:
-        pipeline.make_folder(output)
+        outputs.make_folder(output)
     job = pipeline.Job(run, run_file, output, notes)
     return pipeline.fit_frame(job, posterior, estimate, resume=resume, overwrite=overwrite, say=say)
 
@@ -209,7 +209,7 @@ def study(
     else:
         posterior, truth = build.simulated(run, run_file, simulation.seed)
     if s.path is None:
-        pipeline.make_folder(table)
+        outputs.make_folder(table)
     with ExitStack() as stack:
         stack.enter_context(pipeline.naming(run_file))
         executor = stack.enter_context(cluster(scheduler)) if scheduler else None
@@ -273,10 +273,10 @@ def report(
     """
     path = Path(chain_file)
     chain = open_chain(path)
-    page, picture = pipeline.beside(path)
+    page, picture = outputs.beside(path)
     if out is not None:
         page, picture = Path(out), Path(out).with_suffix(".png")
-    pipeline.may_write_page(page, picture, inputs=(path,), overwrite=overwrite)
+    outputs.may_write_page(page, picture, inputs=(path,), overwrite=overwrite)
     target = target_ess or chain.target_ess
     return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
 

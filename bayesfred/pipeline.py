@@ -18,7 +18,7 @@ from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
-from bayesfred.io import atomic, frames, paths
+from bayesfred.io import atomic, frames, outputs, paths
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -42,10 +42,7 @@ __all__ = [
     "Simulated",
     "Study",
     "Verification",
-    "beside",
     "fit_frame",
-    "make_folder",
-    "may_write_page",
     "naming",
     "read_frame",
     "write_results",
@@ -259,7 +256,7 @@ def fit_frame(
         raise InputError(
             f"{output}: no folder {output.parent}, expected one to write the chain to: create it"
         )
-    others = beside(output)
+    others = outputs.beside(output)
     hidden = (output.with_name(f".{output.name}.{kind}") for kind in ("lock", "tmp", "writer"))
     for path in (output, *others, *hidden):
         if os.path.islink(path) or os.path.isdir(path):
@@ -334,7 +331,7 @@ def write_results(
     diagnostics = diagnose(chain, target_ess=target_ess)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
-    page, picture = beside(page)
+    page, picture = outputs.beside(page)
     write_report(
         page,
         chain=chain,
@@ -344,74 +341,6 @@ def write_results(
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
     return Result(chain, diagnostics, table, path, page, picture)
-
-
-def beside(path: Path) -> tuple[Path, Path]:
-    """Name the page and the picture of a chain file, or the picture of a page.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    page, picture : Path
-
-    Examples
-    --------
-    >>> [path.name for path in beside(Path("run.h5"))]
-    ['run.html', 'run.png']
-    """
-    return path.with_suffix(".html"), path.with_suffix(".png")
-
-
-def may_write_page(page: Path, *others: Path, inputs: Sequence[Path], overwrite: bool) -> None:
-    """Refuse a page that nobody asked to replace, or that cannot be written where it should go.
-
-    Parameters
-    ----------
-    page : Path
-    *others : Path
-        Files that are written with it.
-    inputs : sequence of Path
-        Chain files that it is made of.
-    overwrite : bool
-        Whether page and others may be replaced.
-
-    Raises
-    ------
-    InputError
-        If a file exists, the page is not called NAME.html, its folder is missing, or a chain would
-        be replaced.
-    """
-    for path in inputs:
-        if any(os.path.abspath(path) == os.path.abspath(place) for place in (page, *others)):
-            raise InputError(
-                f"{path}: got a chain named as its report, which would replace it, expected "
-                "NAME.h5: rename it"
-            )
-    if page.suffix != ".html":
-        raise InputError(f"{page}: got a page with another suffix, expected NAME.html")
-    if not page.parent.is_dir():
-        raise InputError(f"{page}: no folder {page.parent}, expected one to write to: create it")
-    paths.may_write(page, overwrite=overwrite, beside=others)
-
-
-def make_folder(path: Path) -> None:
-    """Create the folder of an output file, unless it exists.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be created.
-    """
-    with atomic.writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
