@@ -257,9 +257,10 @@ def report(
         Parameters to show in pairs; by default all, or of more than twelve those of the most
         correlated pairs.
     out : path-like, optional
-        The page, .html; by default beside the chain. The picture, .png, goes beside the page.
+        The page, .html; by default beside the chain. The picture, .png, and the table of sources,
+        .sources.ecsv, go beside the page.
     overwrite : bool
-        Replace page and picture.
+        Replace page, picture and table.
 
     Returns
     -------
@@ -268,15 +269,15 @@ def report(
     Raises
     ------
     InputError
-        If the chain is missing, damaged, or named as its page or picture would be; if a page or
-        picture exists, or `corner` names what is no parameter.
+        If the chain is missing, damaged, or named as its page or picture would be; if a page,
+        picture or table exists, or `corner` names what is no parameter.
     """
     path = Path(chain_file)
     chain = open_chain(path)
-    page, picture = outputs.beside(path)
+    page, *others = outputs.beside(path if out is None else Path(out))
     if out is not None:
-        page, picture = Path(out), Path(out).with_suffix(".png")
-    outputs.may_write_page(page, picture, inputs=(path,), overwrite=overwrite)
+        page = Path(out)
+    outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
     target = target_ess or chain.target_ess
     return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
 

@@ -18,7 +18,7 @@ from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
-from bayesfred.io import atomic, frames, outputs, paths
+from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -50,6 +50,13 @@ __all__ = [
 
 Say = Callable[[str], None]
 
+SOURCES_META = {
+    "x, y": "catalogue position, fine pixel from the middle of the frame",
+    "u, v, du, dv, phase": "recorded pixel, u and v from the middle of the frame",
+    "flux, peak": "counts",
+    "columns": "see bayesfred.analysis.sources.source_table",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -61,8 +68,8 @@ class Result:
     diagnostics : Diagnostics
     summary : astropy.table.Table
         The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
-    path, page, picture : Path
-        The files: the chain, its report and its picture.
+    path, page, picture, sources : Path
+        The files: the chain, its report, its picture and its table of sources.
     """
 
     chain: Chain
@@ -71,6 +78,7 @@ class Result:
     path: Path
     page: Path
     picture: Path
+    sources: Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +310,7 @@ def _record(job: Job, before: Chain | None) -> RunRecord:
 def write_results(
     chain: Chain, path: Path, page: Path, *, target_ess: float, corner: Sequence[str] = ()
 ) -> Result:
-    """Judge a chain, and write its page and picture.
+    """Judge a chain, and write its page, picture and table of sources.
 
     Parameters
     ----------
@@ -323,7 +331,7 @@ def write_results(
     Raises
     ------
     InputError
-        If page or picture cannot be written, or `corner` names what is no parameter.
+        If a file cannot be written, or `corner` names what is no parameter.
     """
     posterior = chain.posterior()
     truth = chain.record.truth if chain.record else None
@@ -331,7 +339,7 @@ def write_results(
     diagnostics = diagnose(chain, target_ess=target_ess)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
-    page, picture = outputs.beside(page)
+    page, picture, sources = outputs.beside(page)
     write_report(
         page,
         chain=chain,
@@ -340,7 +348,10 @@ def write_results(
         figures=page_figures(fitted, chain, diagnostics, shown=shown, truth=truth),
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
-    return Result(chain, diagnostics, table, path, page, picture)
+    found = diagnostics.sources
+    columns = {name: found[name].data for name in found.colnames}
+    tables.write_table(sources, tables.TableRecord(columns, SOURCES_META), overwrite=True)
+    return Result(chain, diagnostics, table, path, page, picture, sources)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ __all__ = ["PixelPhase", "harmonics", "phase_check", "pixel_phase"]
 
 FEWEST = 12  # sources
 HARMONICS = 2
-LEFT = 0.01  # share of an amplitude's variance that the fit must leave
+LEFT = 0.1  # share of an amplitude's variance that the fit must leave
 
 
 class PixelPhase(NamedTuple):

@@ -15,8 +15,8 @@ from bayesfred.io.paths import may_write
 __all__ = ["beside", "make_folder", "may_write_page"]
 
 
-def beside(path: Path) -> tuple[Path, Path]:
-    """Name the page and the picture of a chain file, or the picture of a page.
+def beside(path: Path) -> tuple[Path, Path, Path]:
+    """Name the page, the picture and the table of sources of a chain file, or those of a page.
 
     Parameters
     ----------
@@ -24,14 +24,15 @@ def beside(path: Path) -> tuple[Path, Path]:
 
     Returns
     -------
-    page, picture : Path
+    page, picture, sources : Path
 
     Examples
     --------
     >>> [path.name for path in beside(Path("run.h5"))]
-    ['run.html', 'run.png']
+    ['run.html', 'run.png', 'run.sources.ecsv']
     """
-    return path.with_suffix(".html"), path.with_suffix(".png")
+    page, picture, sources = (path.with_suffix(s) for s in (".html", ".png", ".sources.ecsv"))
+    return page, picture, sources
 
 
 def may_write_page(page: Path, *others: Path, inputs: Sequence[Path], overwrite: bool) -> None:

@@ -15,6 +15,7 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.frames import MAX_STARS, FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.goodness import described_residuals, residual_panels
 from bayesfred.reporting.posteriors import corner_plot, marginal_plot, trace_plot
 from bayesfred.sampling.chain import Chain
 
@@ -82,6 +83,13 @@ def page_figures(
             "source.",
             _described_stars(fitted, u, v),
             star_panels(fitted, u, v, half_width=half_width),
+        ),
+        PageFigure(
+            "Residuals",
+            "Their distribution beside that of a true model, the displacement of the sources "
+            "against the position of their images within a pixel, and every source's chi-square.",
+            described_residuals(diagnostics.residuals),
+            residual_panels(diagnostics.residuals, posterior.model.detector.shape),
         ),
         *_posterior_figures(chain, shown, truth),
         PageFigure(
