@@ -20,6 +20,7 @@ from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
 from .sampling.laplace import laplace
 from .sampling.moves import LaplaceMove
+from .sampling.record import RunRecord
 from .sampling.sampler import sample
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "PolynomialDistortion",
     "Posterior",
     "PosteriorCalibration",
+    "RunRecord",
     "SampledPSF",
     "SourceCatalog",
     "calibrate_posterior",

@@ -16,6 +16,7 @@ from bayesfred.io.summary_table import Table
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.displacement import displacement
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.summary import summary
 
 __all__ = ["Chain", "Method"]
@@ -56,6 +57,8 @@ class Chain:
     method : {"mcmc", "laplace"}
         How the draws were made: by the sampler, or independently from the Laplace approximation,
         see `laplace`.
+    record : RunRecord or None
+        Title, frame, settings, notes and truth of the run, where they were given.
     """
 
     path: Path | None
@@ -71,6 +74,7 @@ class Chain:
     target_ess: float = 1000.0
     n_invalid: int = 0
     method: Method = "mcmc"
+    record: RunRecord | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
