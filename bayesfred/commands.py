@@ -38,7 +38,12 @@ DEMO_NOTE = (
 
 
 def demo(
-    folder: PathLike, *, seed: int = 1, overwrite: bool = False, say: Say | None = None
+    folder: PathLike,
+    *,
+    seed: int = 1,
+    map_only: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result:
     """Simulate the frame of the example run file, which is the paper's, and fit it.
 
@@ -48,6 +53,8 @@ def demo(
         Where demo.h5 goes; created if it does not exist.
     seed : int
         Seed of the frame and of the sampler.
+    map_only : bool
+        Do not sample, see `fit`.
     overwrite : bool
         Replace an earlier demo.
     say : callable, optional
@@ -70,7 +77,7 @@ def demo(
     run = run.model_copy(update={**seeded, "study": None})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
-    return pipeline.fit_frame(job, posterior, overwrite=overwrite, say=say)
+    return pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
@@ -116,7 +123,12 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
 
 
 def fit(
-    run_file: PathLike, *, resume: bool = False, overwrite: bool = False, say: Say | None = None
+    run_file: PathLike,
+    *,
+    map_only: bool = False,
+    resume: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result:
     """Fit the frame of a run file: MAP, draws, diagnostics, report.
 
@@ -124,6 +136,8 @@ def fit(
     ----------
     run_file : path-like
         TOML, see `bayesfred fit --help`.
+    map_only : bool
+        Do not sample: draw from the Laplace approximation at the maximum, see `bf.laplace`.
     resume : bool
         Resume the run in the output file.
     overwrite : bool
@@ -155,7 +169,9 @@ def fit(
     if run.output.path is None:
         outputs.make_folder(output)
     job = pipeline.Job(run, run_file, output, notes)
-    return pipeline.fit_frame(job, posterior, estimate, resume=resume, overwrite=overwrite, say=say)
+    return pipeline.fit_frame(
+        job, posterior, estimate, map_only=map_only, resume=resume, overwrite=overwrite, say=say
+    )
 
 
 def study(

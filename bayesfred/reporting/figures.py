@@ -70,7 +70,7 @@ def page_figures(
     """
     posterior = chain.posterior()
     u, v, half_width = _star_positions(chain, posterior)
-    return [
+    figures = [
         PageFigure(
             "Frame, model and residual",
             "At the MAP. Green pixels do not enter the likelihood.",
@@ -92,14 +92,18 @@ def page_figures(
             residual_panels(diagnostics.residuals, posterior.model.detector.shape),
         ),
         *_posterior_figures(chain, shown, truth),
-        PageFigure(
-            "Chain",
-            "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
-            "at 1 when all ensembles sample one distribution.",
-            _described_chain(chain, diagnostics),
-            trace_plot(chain, posterior.parameters),
-        ),
     ]
+    if chain.method == "mcmc":
+        figures.append(
+            PageFigure(
+                "Chain",
+                "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
+                "at 1 when all ensembles sample one distribution.",
+                _described_chain(chain, diagnostics),
+                trace_plot(chain, posterior.parameters),
+            )
+        )
+    return figures
 
 
 def _posterior_figures(

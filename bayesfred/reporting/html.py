@@ -249,7 +249,10 @@ def _row(values: dict[str, Any], parameter: Parameter, levels: Floats) -> dict[s
         "interval_68": f"{bounds[1]} … {bounds[2]}",
         "interval_95": f"{bounds[0]} … {bounds[3]}",
     }
-    return cells | {key: f"{values[key]:.{digits}f}" for key, digits in DIGITS.items()}
+    return cells | {
+        key: f"{values[key]:.{digits}f}" if math.isfinite(values[key]) else ""
+        for key, digits in DIGITS.items()
+    }
 
 
 def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
@@ -290,15 +293,20 @@ def _statistic(name: str, value: float, expected: float, sd: float, meaning: str
 
 def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     n_ensembles, n_steps, n_walkers, d = chain.chain.shape
+    drawn = f"{diagnostics.n_draws} of {d} parameters, "
+    if chain.method == "mcmc":
+        how = [
+            ("sampler", f"{n_ensembles} ensembles of {n_walkers} walkers"),
+            ("steps", f"{n_steps}, {chain.burn_in} of them burn-in"),
+            ("draws", f"{drawn}acceptance {diagnostics.acceptance:.1%}"),
+        ]
+    else:
+        efficiency = f"importance efficiency {diagnostics.importance_efficiency:.0%}"
+        how = [("draws", f"{drawn}independent, of the Laplace approximation, {efficiency}")]
     return [
         ("chain file", printable(str(chain.path))),
         ("seed", str(chain.seed)),
-        ("sampler", f"{n_ensembles} ensembles of {n_walkers} walkers"),
-        ("steps", f"{n_steps}, {chain.burn_in} of them burn-in"),
-        (
-            "draws",
-            f"{diagnostics.n_draws} of {d} parameters, acceptance {diagnostics.acceptance:.1%}",
-        ),
+        *how,
         ("MAP", f"{chain.estimate.message} ({chain.estimate.n_evaluations} evaluations)"),
         ("pixels used", str(diagnostics.n_pixels)),
         (
