@@ -25,7 +25,7 @@ from bayesfred.io.summary_table import Table
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
-from bayesfred.reporting.labels import html_symbol, html_unit, scale_of
+from bayesfred.reporting.labels import html_symbol, html_unit, scale_of, with_error
 from bayesfred.reporting.posteriors import corner_plot, trace_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
@@ -144,6 +144,7 @@ def _row(values: dict[str, Any], parameter: Parameter) -> dict[str, str]:
         "symbol": html_symbol(parameter),
         "unit": html_unit(parameter, scale.exponent),
         "z": _z(values["z"]) if "z" in values else "",
+        "corner": _minus(with_error(values["corner"], values["corner_sd"]).replace("+-", "±")),
     }
     return cells | {key: f"{values[key]:.{digits}f}" for key, digits in DIGITS.items()}
 

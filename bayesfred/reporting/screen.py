@@ -12,7 +12,7 @@ from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import printable
-from bayesfred.reporting.labels import scale_of
+from bayesfred.reporting.labels import scale_of, with_error
 
 __all__ = ["check_table", "comparison_table", "parameter_table", "study_table"]
 
@@ -34,19 +34,19 @@ def parameter_table(summary: Any) -> Table:
     with_truth = "truth" in summary.colnames
     heads = ["MAP", "posterior mean +- sd"]
     table = _table(
-        "coefficient", *(["truth", *heads, "z"] if with_truth else heads),
-        "R-hat", "ESS", "prior sens.",
+        "parameter", *(["truth", *heads, "z"] if with_truth else heads),
+        "px at corner", "R-hat", "ESS", "prior",
     )  # fmt: skip
     for row in summary:
         scale = scale_of(row["mean"], row["sd"])
         power = f" e{scale.exponent:+03d}" if scale.exponent else ""
-        mean, sd = scale.number(row["mean"]), scale.number(row["sd"])
-        cells = [scale.number(row["MAP"]) + power, f"{mean} +- {sd}{power}"]
+        cells = [scale.number(row["MAP"]) + power, with_error(row["mean"], row["sd"])]
         if with_truth:
             cells = [scale.number(row["truth"]) + power, *cells, f"{row['z']:+.2f}"]
         table.add_row(
             row["name"],
             *cells,
+            with_error(row["corner"], row["corner_sd"]),
             f"{row['rhat']:.3f}",
             f"{min(row['ess_bulk'], row['ess_tail']):.0f}",
             f"{row['prior_sensitivity']:.3f}",
