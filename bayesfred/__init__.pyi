@@ -1,7 +1,9 @@
 from . import commands, show
 from .analysis.comparison import Comparison, compare
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
+from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.sbc import PosteriorCalibration, calibrate_posterior
 from .errors import InputError
 from .imaging.catalog import SourceCatalog
@@ -26,6 +28,7 @@ __all__ = [
     "Comparison",
     "Detector",
     "Diagnostics",
+    "DisplacementField",
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",
@@ -36,6 +39,7 @@ __all__ = [
     "MoffatPSF",
     "NoiseStudy",
     "Nuisances",
+    "PhotonsNeeded",
     "PoissonNoise",
     "PolynomialDistortion",
     "Posterior",
@@ -47,9 +51,11 @@ __all__ = [
     "compare",
     "correct_sampling",
     "diagnose",
+    "displacement_field",
     "find_map",
     "noise_study",
     "open_chain",
+    "photons_needed",
     "reject_outliers",
     "sample",
     "sampling_matrix",

@@ -7,6 +7,7 @@ Every command returns a record and prints nothing. What should be known while it
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from bayesfred.analysis import comparison
 from bayesfred.analysis import verify as verification
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
+from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
 from bayesfred.io import atomic, paths
@@ -28,6 +30,7 @@ from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
+DEMO_ERROR = 0.001  # pixel
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
     "PSF of 10 pixels. The coefficients are those of its Table 2, read with g in y and the columns "
@@ -68,7 +71,9 @@ def demo(
     run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
-    return pipeline.fit_frame(job, posterior, overwrite=overwrite, say=say)
+    result = pipeline.fit_frame(job, posterior, overwrite=overwrite, say=say)
+    needed = photons_needed(posterior, result.chain.estimate.params, DEMO_ERROR)
+    return replace(result, photons=needed)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:

@@ -14,7 +14,9 @@ import numpy as np
 from bayesfred import build, settings
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
+from bayesfred.analysis.field import DisplacementField, displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
+from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
@@ -57,18 +59,24 @@ class Result:
     ----------
     chain : Chain
     diagnostics : Diagnostics
+    field : DisplacementField
+        How far the frame displaces its objects, and how well that is known.
     summary : astropy.table.Table
         The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
     path, page, picture : Path
         The files: the chain, its report and its picture.
+    photons : PhotonsNeeded, optional
+        What a smaller error would take, where that was asked.
     """
 
     chain: Chain
     diagnostics: Diagnostics
+    field: DisplacementField
     summary: Table
     path: Path
     page: Path
     picture: Path
+    photons: PhotonsNeeded | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,6 +312,7 @@ def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_es
     """
     posterior, truth = chain.posterior(), job.truth if job else None
     diagnostics = diagnose(chain, target_ess=target_ess)
+    field = displacement_field(chain)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
     page, picture = beside(path)
@@ -313,12 +322,13 @@ def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_es
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
-        figures=page_figures(fitted, chain, truth=truth),
+        figures=page_figures(fitted, chain, truth=truth, field=field),
+        result=field.message,
         notes=job.notes if job else (),
         settings=job.run.model_dump_json(indent=2) if job else None,
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
-    return Result(chain, diagnostics, table, path, page, picture)
+    return Result(chain, diagnostics, field, table, path, page, picture)
 
 
 def beside(chain: Path) -> tuple[Path, Path]:

@@ -30,6 +30,9 @@ def show_run(result: Result) -> bool:
             "decide alone, see the report"
         )
     _print_files(chain=result.path, report=result.page, picture=result.picture)
+    print(result.field.message)
+    if result.photons:
+        print(result.photons.message)
     print(diagnostics.message)
     return diagnostics.trustworthy
 

@@ -19,11 +19,14 @@ from matplotlib.figure import Figure
 
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.analysis.field import DisplacementField
+from bayesfred.analysis.sources import source_table
 from bayesfred.errors import printable
 from bayesfred.io import atomic
 from bayesfred.io.summary_table import Table
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
+from bayesfred.reporting.field import field_plot
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
 from bayesfred.reporting.labels import html_symbol, html_unit, scale_of, with_error
 from bayesfred.reporting.posteriors import corner_plot, trace_plot
@@ -71,6 +74,7 @@ def write_report(
     summary: Table,
     diagnostics: Diagnostics,
     figures: Sequence[PageFigure] = (),
+    result: str | None = None,
     notes: Sequence[str] = (),
     settings: str | None = None,
 ) -> Path:
@@ -90,6 +94,8 @@ def write_report(
         What `diagnose` said of `chain`.
     figures : sequence of PageFigure, optional
         In the page's order.
+    result : str, optional
+        What the run found, in a sentence.
     notes : sequence of str, optional
         Paragraphs of plain text.
     settings : str, optional
@@ -125,6 +131,7 @@ def write_report(
         statistics=_statistics(diagnostics),
         figures=[(f.heading, f.caption, _data_uri(f.figure)) for f in figures],
         provenance=_provenance(chain, diagnostics),
+        result=result,
         notes=notes,
         settings=settings,
     )
@@ -186,7 +193,11 @@ def _statistic(name: str, value: float, expected: float, sd: float, meaning: str
 
 
 def page_figures(
-    fitted: FittedFrame, chain: Chain, *, truth: Floats | None = None
+    fitted: FittedFrame,
+    chain: Chain,
+    *,
+    truth: Floats | None = None,
+    field: DisplacementField | None = None,
 ) -> list[PageFigure]:
     """The figures of a run's page.
 
@@ -197,6 +208,8 @@ def page_figures(
     chain : Chain
     truth : ndarray, shape (d,), parameter units, optional
         Values that a simulation used.
+    field : DisplacementField, optional
+        Of the chain; its figure comes first.
 
     Returns
     -------
@@ -205,6 +218,7 @@ def page_figures(
     posterior = chain.posterior()
     u, v, half_width = _star_positions(chain, posterior)
     return [
+        *(() if field is None else [_field_figure(field, chain, posterior)]),
         PageFigure(
             "Frame, model and residual",
             "At the MAP. Grey pixels do not enter the likelihood.",
@@ -230,6 +244,19 @@ def page_figures(
             trace_plot(chain, posterior.parameters),
         ),
     ]
+
+
+def _field_figure(field: DisplacementField, chain: Chain, posterior: Posterior) -> PageFigure:
+    sources = source_table(posterior, chain.estimate.params)
+    return PageFigure(
+        "Displacement",
+        "Above: from the object to its image, with the error that the posterior gives it. What is "
+        "hatched lies beyond the sources, where only the terms of the distortion say what happens; "
+        "its ellipses are grey. Below: by how much the counts of each source say that its image is "
+        "off the place where the model has it; arrows that agree with their neighbours mean a "
+        "missing term.",
+        field_plot(field, sources, posterior.model.detector.binning),
+    )
 
 
 def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats, int]:
