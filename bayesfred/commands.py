@@ -227,7 +227,7 @@ def study(
                 model, truth[: model.distortion.n_terms], s.background or simulation.background,
                 flux=s.flux or (), sources=s.sources or (), psf_sigma=s.psf_sigma or (),
                 exposure=s.exposure or (), method=s.method or "laplace", noise=posterior.noise,
-                nuisances=posterior.nuisances, prior=build.priors_given(run), **how,
+                nuisances=posterior.nuisances, prior=build.priors_given(run), error=s.error, **how,
             )  # fmt: skip
         else:
             result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import spatial
 
 from bayesfred._typing import Flags, Floats
+from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.parameters import displacing
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
@@ -131,7 +132,7 @@ def displacement_field(chain: Chain) -> DisplacementField:
     posterior = frame_posterior(chain)
     points = field_points(posterior, chain.estimate.params)
     at = displacement(chain, points.u, points.v)
-    return _field(points, *at, pixel_unit(posterior))
+    return _field(points, *at, pixel_unit(posterior.model))
 
 
 def field_points(posterior: Posterior, params: Floats) -> FieldPoints:
@@ -219,18 +220,18 @@ def rms(weights: Floats, values: Floats) -> float:
     return math.sqrt(np.average(values[known] ** 2, weights=weights[known]))
 
 
-def pixel_unit(posterior: Posterior) -> str:
+def pixel_unit(model: ForwardModel) -> str:
     """What a pixel is called in which displacements are given.
 
     Parameters
     ----------
-    posterior : Posterior
+    model : ForwardModel
 
     Returns
     -------
     str
     """
-    return "px" if posterior.model.detector.binning == 1 else "fine px"
+    return "px" if model.detector.binning == 1 else "fine px"
 
 
 def _sd(covariance: Floats) -> Floats:

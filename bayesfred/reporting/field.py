@@ -27,7 +27,7 @@ __all__ = ["field_plot"]
 SIZES = LinearSegmentedColormap.from_list("sizes", ["#ffffff", "#9ecae1", "#4292c6"])
 EXTRAPOLATED = "0.45"
 SIGNIFICANT = 3.0  # standard deviations
-WIDTH = 7.0  # inch
+WIDTH = 6.2  # inch
 
 Strings = NDArray[np.str_]
 
@@ -111,7 +111,7 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
     colours = np.where(far, TRUTH_COLOUR, POSTERIOR_COLOUR)
     arrows = _arrows(ax, at, off, 3.0 * _spacing(field), unit, colours)
     ax.set_title(
-        f"sources, displaced from the model{arrows}\n{far.sum()} of {len(at)} by more than "
+        f"sources, off the model{arrows}\n{far.sum()} of {len(at)} by more than "
         f"{SIGNIFICANT:.0f} standard deviations{', orange' if far.any() else ''}",
         loc="left", fontsize=11,
     )  # fmt: skip
@@ -120,7 +120,7 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
 def _arrows(
     ax: Axes, at: Floats, vectors: Floats, longest: float, unit: str, colours: Strings | str = "k"
 ) -> str:
-    """Arrows of which the longest has this length on the axes, and one of known length above.
+    """Arrows of which the longest has this length on the axes, and one of known length below.
 
     Returns how they are enlarged, for the title.
     """
@@ -134,7 +134,7 @@ def _arrows(
     )  # fmt: skip
     left = 1.0 - enlarged * key / float(np.ptp(ax.get_xlim()))
     ax.quiverkey(
-        arrows, left, 1.03, enlarged * key, f"{key:,.10g} {unit}", labelpos="W", color="k",
+        arrows, left, -0.1, enlarged * key, f"{key:,.10g} {unit}", labelpos="W", color="k",
         fontproperties={"size": 11},
     )  # fmt: skip
     return f": arrows {_times(enlarged)}"
