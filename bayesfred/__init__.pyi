@@ -2,7 +2,9 @@ from . import commands, show
 from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
+from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.sbc import PosteriorCalibration, calibrate_posterior
 from .errors import InputError
 from .imaging.catalog import SourceCatalog
@@ -30,6 +32,7 @@ __all__ = [
     "CrossCheck",
     "Detector",
     "Diagnostics",
+    "DisplacementField",
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",
@@ -40,6 +43,7 @@ __all__ = [
     "MoffatPSF",
     "NoiseStudy",
     "Nuisances",
+    "PhotonsNeeded",
     "PoissonNoise",
     "PolynomialDistortion",
     "Posterior",
@@ -53,10 +57,12 @@ __all__ = [
     "correct_sampling",
     "cross_check",
     "diagnose",
+    "displacement_field",
     "find_map",
     "laplace",
     "noise_study",
     "open_chain",
+    "photons_needed",
     "reject_outliers",
     "sample",
     "sampling_matrix",

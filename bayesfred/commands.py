@@ -7,6 +7,7 @@ Every command returns a record and prints nothing. What should be known while it
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
+from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
 from bayesfred.io import atomic, outputs, paths
@@ -29,6 +31,7 @@ from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
 _SEEDED = ("sampling", "simulation")
+DEMO_ERROR = 0.001  # pixel
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
     "PSF of 10 pixels. The coefficients are those of its Table 2, read with g in y and the columns "
@@ -77,7 +80,9 @@ def demo(
     run = run.model_copy(update={**seeded, "study": None})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
-    return pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
+    result = pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
+    needed = photons_needed(posterior, result.chain.estimate.params, DEMO_ERROR)
+    return replace(result, photons=needed)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
@@ -240,7 +245,7 @@ def study(
                 model, truth[: model.distortion.n_terms], s.background or simulation.background,
                 flux=s.flux or (), sources=s.sources or (), psf_sigma=s.psf_sigma or (),
                 exposure=s.exposure or (), method=s.method or "laplace", noise=posterior.noise,
-                nuisances=posterior.nuisances, prior=build.priors_given(run), **how,
+                nuisances=posterior.nuisances, prior=build.priors_given(run), error=s.error, **how,
             )  # fmt: skip
         else:
             result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)

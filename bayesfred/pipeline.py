@@ -14,7 +14,9 @@ import numpy as np
 from bayesfred import build, settings
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
+from bayesfred.analysis.field import DisplacementField, displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
+from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
@@ -67,19 +69,25 @@ class Result:
     ----------
     chain : Chain
     diagnostics : Diagnostics
+    field : DisplacementField
+        How far the frame displaces its objects, and how well that is known.
     summary : astropy.table.Table
         The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
     path, page, picture, sources : Path
         The files: the chain, its report, its picture and its table of sources.
+    photons : PhotonsNeeded, optional
+        What a smaller error would take, where that was asked.
     """
 
     chain: Chain
     diagnostics: Diagnostics
+    field: DisplacementField
     summary: Table
     path: Path
     page: Path
     picture: Path
     sources: Path
+    photons: PhotonsNeeded | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,6 +361,7 @@ def write_results(
     truth = chain.record.truth if chain.record else None
     shown = corner_parameters(chain.draws(), chain.parameter_names, corner)
     diagnostics = diagnose(chain, target_ess=target_ess)
+    field = displacement_field(chain)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
     page, picture, sources = outputs.beside(page)
@@ -361,13 +370,14 @@ def write_results(
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
-        figures=page_figures(fitted, chain, diagnostics, shown=shown, truth=truth),
+        figures=page_figures(fitted, chain, diagnostics, field, shown=shown, truth=truth),
+        result=field.message,
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
     found = diagnostics.sources
     columns = {name: found[name].data for name in found.colnames}
     tables.write_table(sources, tables.TableRecord(columns, SOURCES_META), overwrite=True)
-    return Result(chain, diagnostics, table, path, page, picture, sources)
+    return Result(chain, diagnostics, field, table, path, page, picture, sources)
 
 
 @contextmanager

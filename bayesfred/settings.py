@@ -279,13 +279,11 @@ class StudySettings(Section):
     Attributes
     ----------
     kind : {'noise', 'sbc'}
-        Fits of the truth of [simulation] at several noise levels, or simulation-based calibration:
-        truths from the priors.
+        Fits of the truth of [simulation] at several noise levels, or of truths from the priors.
     replicates : int
         Frames of every noise level, or of the calibration.
     method : {'laplace', 'mcmc'}, optional
-        The maximum with its Fisher information, or draws; by default the first for 'noise', the
-        second for 'sbc'.
+        Maximum and Fisher information, the default of 'noise', or draws, the default of 'sbc'.
     seed : int
         Seed of every random number.
     background : tuple of float, optional, counts per pixel
@@ -298,6 +296,8 @@ class StudySettings(Section):
         Widths of the PSF.
     exposure : tuple of float, optional
         Factors of flux and background together.
+    error : float, pixel
+        The rms error of the displacement for which a noise study counts photons.
     path : str, optional
         The table of results, .ecsv, inside the folder that the study is started in.
     """
@@ -311,6 +311,7 @@ class StudySettings(Section):
     sources: tuple[_Count, ...] | None = None
     psf_sigma: tuple[_Positive, ...] | None = None
     exposure: tuple[_Positive, ...] | None = None
+    error: _Positive = 0.01
     path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None
 
 

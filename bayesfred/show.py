@@ -34,6 +34,9 @@ def show_run(result: Result) -> bool:
     _print_files(
         chain=result.path, report=result.page, picture=result.picture, sources=result.sources
     )
+    print(result.field.message)
+    if result.photons:
+        print(result.photons.message)
     print(diagnostics.message)
     return diagnostics.trustworthy
 

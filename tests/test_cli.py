@@ -171,7 +171,7 @@ def test_fit_leaves_a_chain_a_page_and_a_picture(finished: tuple[Path, Output]) 
     visible = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
     assert visible == {"run.toml", "frame.fits", "stars.csv", "run.h5", "run.html", "run.png"}
     for word in (
-        "coefficient",
+        "parameter",
         "MAP",
         "posterior mean",
         "R-hat",

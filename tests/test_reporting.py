@@ -335,11 +335,15 @@ def test_screen_page_and_summary_show_the_same_numbers(tmp_path: Path) -> None:
     np.testing.assert_allclose(table["z"], (table["mean"] - truth) / table["sd"])
     assert table["name"].tolist() == list(chain.parameter_names)
     assert table["unit"].tolist() == ["px^-1", "px^-2", "px^-1", "px^-2", "counts"]
+    # u x, u x^2, v y and v y^2 in the corner of a frame of 61 x 81 pixels; no counts displace
+    size = np.array([40.5**2, 40.5**3, 30.5**2, 30.5**3, np.nan])
+    np.testing.assert_allclose(table["corner"], size * table["mean"], rtol=1e-12)
+    np.testing.assert_allclose(table["corner_sd"], size * table["sd"], rtol=1e-12)
 
     _, page = report(tmp_path, truth=truth, chain=chain, diagnostics=diagnostics)
     body = page.text.replace("−", "-")
     rows = zip(table, shown(parameter_table(table)), strict=True)
-    for values, (name, true, estimate, posterior, z, rhat, ess, prior) in rows:
+    for values, (name, true, estimate, posterior, z, corner, rhat, ess, prior) in rows:
         assert name == values["name"]
         mean, _, sd, *power = posterior.split()
         scale = float(f"1{power[0]}" if power else 1)
@@ -348,6 +352,13 @@ def test_screen_page_and_summary_show_the_same_numbers(tmp_path: Path) -> None:
             assert abs(float(number) * scale - values[key]) <= 0.06 * values["sd"], key
             assert f" {number} " in f" {body} "
         assert float(z) == pytest.approx(values["z"], abs=0.006) and f" {z} " in body
+        if name == "background":
+            assert corner == ""
+        else:
+            size, _, error, *power = corner.split()
+            scale = float(f"1{power[0]}" if power else 1)
+            assert abs(float(size) * scale - values["corner"]) <= 0.06 * values["corner_sd"]
+            assert f" {size} ± {error} " in f" {body} "
         assert float(rhat) == pytest.approx(values["rhat"], abs=6e-4)
         assert float(ess) == round(min(values["ess_bulk"], values["ess_tail"])) and ess in body
         assert float(prior) == pytest.approx(values["prior_sensitivity"], abs=6e-4)
@@ -358,9 +369,37 @@ def test_summary_of_a_chain_computes_what_diagnose_says() -> None:
     chain, _ = run()
     diagnostics = diagnose(chain)
     table = summary(chain)
-    assert table.colnames == ["name", "unit", "MAP", "mean", "sd", "rhat", "ess_bulk", "ess_tail"]
+    numbers = ["MAP", "mean", "sd", "corner", "corner_sd", "rhat", "ess_bulk", "ess_tail"]
+    assert table.colnames == ["name", "unit", *numbers]
     for key in ("rhat", "ess_bulk", "ess_tail"):
         assert table[key].tolist() == list(getattr(diagnostics, key).values())
+
+
+def test_a_term_at_the_corner_is_its_largest_displacement_there() -> None:
+    """A Zernike term by a naive loop over the corners; a common coefficient; an offset."""
+    lens = PolynomialDistortion.radial_tangential(focal_length=100.0)
+    for distortion in (PolynomialDistortion.zernike(3, radius=50.0), lens):
+        model = ForwardModel(
+            Detector((40, 60)), SourceCatalog.grid(3, 15.0, 500.0), GaussianPSF(2.0), distortion
+        )
+        posterior = Posterior(model, np.ones((40, 60)), nuisances=Nuisances(offset=True))
+        draws = np.random.default_rng(1).normal(1.0, 0.1, (4, 9, 32, posterior.n_parameters))
+        chain = SimpleNamespace(
+            chain=draws, burn_in=0, parameter_names=posterior.parameter_names,
+            draws=lambda draws=draws: draws.reshape(-1, draws.shape[-1]),
+            posterior=lambda posterior=posterior: posterior,
+            estimate=SimpleNamespace(params=np.ones(posterior.n_parameters)),
+        )  # fmt: skip
+        table = summary(chain)
+        for k in range(distortion.n_terms):
+            unit = np.eye(distortion.n_terms)[k]
+            largest = max(
+                np.hypot(*distortion.displacement(unit, x, y, x, y))
+                for x in (-30.0, 30.0) for y in (-20.0, 20.0)
+            )  # fmt: skip
+            assert table["corner"][k] == pytest.approx(largest * table["mean"][k], rel=1e-9)
+        assert np.isnan(table["corner"][distortion.n_terms])  # the background
+        np.testing.assert_array_equal(table["corner"][-2:], table["mean"][-2:])
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.analysis.field import DisplacementField
 from bayesfred.model.posterior import Posterior
+from bayesfred.reporting.field import field_plot
 from bayesfred.reporting.frames import MAX_STARS, FittedFrame, frame_triptych, star_panels
 from bayesfred.reporting.goodness import described_residuals, residual_panels
 from bayesfred.reporting.posteriors import corner_plot, marginal_plot, trace_plot
@@ -46,6 +48,7 @@ def page_figures(
     fitted: FittedFrame,
     chain: Chain,
     diagnostics: Diagnostics,
+    field: DisplacementField,
     *,
     shown: Sequence[int],
     truth: Floats | None = None,
@@ -59,6 +62,8 @@ def page_figures(
     chain : Chain
     diagnostics : Diagnostics
         What `diagnose` said of `chain`.
+    field : DisplacementField
+        Of the chain; its figure comes first.
     shown : sequence of int
         Indices of the parameters that are shown in pairs; the others have histograms.
     truth : ndarray, shape (d,), parameter units, optional
@@ -71,6 +76,16 @@ def page_figures(
     posterior = chain.posterior()
     u, v, half_width = _star_positions(chain, posterior)
     figures = [
+        PageFigure(
+            "Displacement",
+            "Above: from the object to its image, with the error that the posterior gives it. What "
+            "is hatched lies beyond the sources, where only the terms of the distortion say what "
+            "happens; its ellipses are grey. Below: by how much the counts of each source say that "
+            "its image is off the place where the model has it; arrows that agree with their "
+            "neighbours mean a missing term.",
+            field.message,
+            field_plot(field, diagnostics.sources, posterior.model.detector.binning),
+        ),
         PageFigure(
             "Frame, model and residual",
             "At the MAP. Green pixels do not enter the likelihood.",
@@ -97,8 +112,8 @@ def page_figures(
         figures.append(
             PageFigure(
                 "Chain",
-                "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
-                "at 1 when all ensembles sample one distribution.",
+                "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, "
+                "flat at 1 when all ensembles sample one distribution.",
                 _described_chain(chain, diagnostics),
                 trace_plot(chain, posterior.parameters),
             )

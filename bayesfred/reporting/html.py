@@ -26,7 +26,7 @@ from bayesfred.io.summary_table import Table
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.figures import PageFigure
-from bayesfred.reporting.labels import html_symbol, html_unit, scale_of
+from bayesfred.reporting.labels import html_symbol, html_unit, scale_of, with_error
 from bayesfred.reporting.style import embedded
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.record import RunRecord
@@ -246,6 +246,7 @@ def _row(values: dict[str, Any], parameter: Parameter, levels: Floats) -> dict[s
         "symbol": html_symbol(parameter),
         "unit": html_unit(parameter, scale.exponent),
         "z": _z(values["z"]) if "z" in values else "",
+        "corner": _minus(with_error(values["corner"], values["corner_sd"]).replace("+-", "±")),
         "interval_68": f"{bounds[1]} … {bounds[2]}",
         "interval_95": f"{bounds[0]} … {bounds[3]}",
     }

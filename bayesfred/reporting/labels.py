@@ -21,6 +21,7 @@ __all__ = [
     "math_symbol",
     "power_of_ten",
     "scale_of",
+    "with_error",
 ]
 
 
@@ -96,6 +97,31 @@ def scale_of(value: float, sd: float) -> Scale:
     if round(sd / 10.0 ** (digits - 1)) == 100:  # 0.0996 would round to 0.100: three digits
         digits += 1
     return Scale(exponent, max(0, 1 - digits + exponent))
+
+
+def with_error(value: float, sd: float) -> str:
+    """A value with its standard deviation, to two digits of the latter.
+
+    Parameters
+    ----------
+    value, sd : float
+        In one unit.
+
+    Returns
+    -------
+    str
+        Empty where the value is not finite.
+
+    Examples
+    --------
+    >>> with_error(-5.1234, 0.0213), with_error(1.234e-5, 2e-7)
+    ('-5.123 +- 0.021', '1.234 +- 0.020 e-05')
+    """
+    if not math.isfinite(value):
+        return ""
+    scale = scale_of(value, sd)
+    power = f" e{scale.exponent:+03d}" if scale.exponent else ""
+    return f"{scale.number(value)} +- {scale.number(sd)}{power}"
 
 
 def math_symbol(parameter: Parameter) -> str:
