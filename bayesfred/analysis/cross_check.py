@@ -45,14 +45,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import linalg, stats
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.folds import Folds, fold_sources
+from bayesfred.analysis.sources import source_table
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.optimize.find_map import CLOSENESS, find_map
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.moves import LaplaceMove
@@ -128,6 +129,9 @@ class CrossCheck:
         Of the displacement field over the frame.
     coefficients : Agreement
         Of the distortion's coefficients and the pointing.
+    positions : tuple of Agreement
+        Of the image positions found in each half with those that the other half's fit predicts;
+        `factor` is the weighted root mean square of the differences in standard deviations.
     displacement_rms, displacement_expected : float, pixel
         Root mean square difference of the halves' displacements over the field along each axis, and
         what it is expected to be if the errors are right.
@@ -139,6 +143,7 @@ class CrossCheck:
 
     displacement: Agreement
     coefficients: Agreement
+    positions: tuple[Agreement, Agreement]
     displacement_rms: float
     displacement_expected: float
     sources: Ints
@@ -263,31 +268,36 @@ def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) ->
     with threadpool_limits(1, user_api="blas"):
         whole = estimate or find_map(posterior)
         folds = fold_sources(posterior, whole.params, 2)
-        if not (folds.sources == 1).any():
+        n_sources = int(np.sum(folds.sources >= 0))
+        if n_sources < 2:
             raise InputError(
-                f"catalogue: got {int(np.sum(folds.sources >= 0))} sources with an image in the "
-                "frame, expected at least 2 to make halves of: check positions and mask"
+                f"catalogue: got {n_sources} sources with an image in the frame, expected at least "
+                "2 to make halves of: check positions and mask"
             )
         fixed, start = _scatter_fixed(posterior, whole)
-        halves = [_fitted(fixed, folds, k, start) for k in (0, 1)]
-    z, directions = _difference(fixed, halves, start)
-    if not z.size:
-        raise InputError(
-            f"catalogue: got {int(np.sum(folds.sources >= 0))} sources, of which neither half "
-            "determines any coefficient, expected more: fit fewer terms"
+        one, two = (_fitted(fixed, folds, k, start) for k in (0, 1))
+        z, directions = _difference(fixed, (one, two), start)
+        if not z.size:
+            raise InputError(
+                f"catalogue: got {n_sources} sources, half of which determine no coefficient, "
+                "expected more: fit fewer terms"
+            )
+        field = _field(posterior, whole.params, folds.points) @ directions
+        _, spread, components = np.linalg.svd(field / np.sqrt(len(field)), full_matrices=False)
+        share = np.cumsum(spread**2) / np.sum(spread**2)
+        kept = components[: int(np.searchsorted(share, FIELD)) + 1]
+        return CrossCheck(
+            displacement=_agreement(kept @ z),
+            coefficients=_agreement(z),
+            positions=(
+                _predicted(folds.only(fixed, 0), two, folds.sources == 0),
+                _predicted(folds.only(fixed, 1), one, folds.sources == 1),
+            ),
+            displacement_rms=float(np.sqrt(np.mean((field @ z) ** 2))),
+            displacement_expected=float(np.sqrt(np.sum(spread**2))),
+            sources=folds.sources,
+            params=np.array([one.params, two.params]),
         )
-    field = _field(posterior, whole.params, folds.points) @ directions
-    _, spread, components = np.linalg.svd(field / np.sqrt(len(field)), full_matrices=False)
-    share = np.cumsum(spread**2) / np.sum(spread**2)
-    kept = components[: int(np.searchsorted(share, FIELD)) + 1]
-    return CrossCheck(
-        displacement=_agreement(kept @ z),
-        coefficients=_agreement(z),
-        displacement_rms=float(np.sqrt(np.mean((field @ z) ** 2))),
-        displacement_expected=float(np.sqrt(np.sum(spread**2))),
-        sources=folds.sources,
-        params=np.array([half.params for half in halves]),
-    )
 
 
 def _agreement(z: Floats) -> Agreement:
@@ -367,6 +377,33 @@ def _are_coefficients(posterior: Posterior, names: NDArray[np.str_]) -> Flags:
     """Which parameters move images: the distortion's terms and the pointing."""
     terms = (*posterior.model.distortion.names, "offset_x", "offset_y")
     return np.isin(names, terms)
+
+
+def _predicted(half: Posterior, other: _Half, sources: Flags) -> Agreement:
+    """How well the other half's fit predicts where this half's sources are found.
+
+    The positions' errors are those of each source's counts, and of its place in the catalogue where
+    positions scatter. They are independent of the prediction's, which all sources share.
+    """
+    named = dict(zip(half.parameter_names, other.params, strict=True))
+    table, step = source_table(half, other.params)[sources], half.model.detector.binning
+    u, v, du, dv, du_sd, dv_sd = (
+        np.array(table[name]) * step for name in ("u", "v", "du", "dv", "du_sd", "dv_sd")
+    )
+    found = np.isfinite(u + v + du + dv)
+    if not found.any():
+        return Agreement(0.0, 0, np.nan)
+    free = ~np.isin(half.parameter_names, half.hyperparameters)
+    names = np.array(half.parameter_names)[free]
+    information = other.information + half.prior_information(other.params)
+    wanted = _are_coefficients(half, names)
+    covariance = inverse(information[np.ix_(free, free)])[np.ix_(wanted, wanted)]
+    field = _field(half, other.params, np.column_stack([u, v])[found])
+    errors = np.concatenate([du_sd[found], dv_sd[found]]) ** 2
+    errors += named.get("position_scatter", 0.0) ** 2
+    lower = linalg.cholesky(field @ covariance @ field.T + np.diag(errors), lower=True)
+    away = np.concatenate([du[found], dv[found]])
+    return _agreement(linalg.solve_triangular(lower, away, lower=True))
 
 
 def _field(posterior: Posterior, params: Floats, points: Floats) -> Floats:
