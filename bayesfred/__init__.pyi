@@ -19,6 +19,7 @@ from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
 from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
+from .sampling.laplace import laplace
 from .sampling.moves import LaplaceMove
 from .sampling.sampler import sample
 
@@ -54,6 +55,7 @@ __all__ = [
     "cross_check",
     "diagnose",
     "find_map",
+    "laplace",
     "noise_study",
     "open_chain",
     "reject_outliers",

@@ -12,8 +12,10 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bayesfred._typing import Floats
+from bayesfred.errors import InputError
 from bayesfred.imaging.monomials import Exponents
 
 Powers = tuple[int, int]
@@ -135,3 +137,25 @@ def _combined(columns: Mapping[str, tuple[Sum, Sum]]) -> Basis:
 def _by_degree(powers: Powers) -> Powers:
     """Sorts by degree, then by falling power of x."""
     return sum(powers), -powers[0]
+
+
+def checked_basis(basis: ArrayLike, monomials: int) -> Floats:
+    """A read-only copy of the matrix, or an InputError that says what is wrong with it."""
+    try:
+        checked = np.array(basis, dtype=np.float64, order="C")
+    except (TypeError, ValueError):
+        raise InputError("basis: got values that are not numbers, expected a matrix") from None
+    if checked.ndim != 2 or len(checked) != monomials or checked.shape[1] == 0:
+        raise InputError(
+            f"basis: got shape {checked.shape}, expected ({monomials}, number of coefficients): "
+            "one row for every monomial of f, then of g"
+        )
+    if not np.isfinite(checked).all():
+        raise InputError("basis: got values that are not finite, expected numbers")
+    if not checked.any(axis=0).all():
+        empty = int(np.argmin(checked.any(axis=0)))
+        raise InputError(
+            f"basis: got zeros alone in column {empty}, expected a monomial in every column"
+        )
+    checked.setflags(write=False)
+    return checked

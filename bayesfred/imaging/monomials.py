@@ -111,11 +111,11 @@ def newton(
 
     `residual` gives (r, s, r_p, r_q, s_p, s_q); a step is Cramer's rule on [[r_p, r_q], [s_p,
     s_q]]. A point is done with the first step below the tolerance and is then left alone: the next
-    would be rounding.
+    would be rounding. Where no step is that small, or one is not finite, the result is NaN.
     """
     scale = np.maximum(np.maximum(np.abs(p), np.abs(q)), 1.0)
     p, q = p.copy(), q.copy()
-    moving = np.ones(p.shape, dtype=bool)
+    moving, lost = np.ones(p.shape, dtype=bool), np.zeros(p.shape, dtype=bool)
     with np.errstate(all="ignore"):  # a point that diverges overflows; it becomes NaN below
         for _ in range(MAX_ITERATIONS):
             r, s, r_p, r_q, s_p, s_q = residual(p, q)
@@ -125,6 +125,9 @@ def newton(
             p = np.where(moving, p - step_p, p)
             q = np.where(moving, q - step_q, q)
             moving &= ~(np.maximum(np.abs(step_p), np.abs(step_q)) <= RELATIVE_TOLERANCE * scale)
+            lost |= ~np.isfinite(p + q)
+            moving &= ~lost
             if not moving.any():
                 break
-    return np.where(moving, np.nan, p), np.where(moving, np.nan, q)
+    none = moving | lost
+    return np.where(none, np.nan, p), np.where(none, np.nan, q)

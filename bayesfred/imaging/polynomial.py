@@ -8,7 +8,6 @@ coefficients, and the Fisher information T^T I T. `distortion` gives this class 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,13 +15,12 @@ from numpy.typing import ArrayLike
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.imaging.bases import checked_basis
+from bayesfred.imaging.inverse import Terms, displacement_jacobian, object_positions
 from bayesfred.imaging.monomials import (
     Exponents,
-    Point,
     U,
     V,
-    X,
-    Y,
     broadcast,
     checked_terms,
     monomials,
@@ -53,7 +51,7 @@ class Polynomial:
         if monomials == 0:
             raise InputError("f_terms, g_terms: got no term, expected at least one (i, j, m, n)")
         if self.basis is not None:
-            object.__setattr__(self, "basis", _checked_basis(self.basis, monomials))
+            object.__setattr__(self, "basis", checked_basis(self.basis, monomials))
         labels = self.labels.split() if isinstance(self.labels, str) else list(self.labels)
         expected = 0 if self.basis is None else self.basis.shape[1]
         if len(set(labels)) != expected or not all(map(str.isidentifier, labels)):
@@ -239,9 +237,9 @@ class Polynomial:
         >>> print(f, g)
         0.6 0.0
         """
-        f_theta, g_theta = self._split(theta)
+        f, g = self._split(theta)
         point = broadcast(u, v, x, y)
-        return polynomial(f_theta, self.f_terms, point), polynomial(g_theta, self.g_terms, point)
+        return polynomial(*f, point), polynomial(*g, point)
 
     def determinant(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike
@@ -255,17 +253,19 @@ class Polynomial:
         -------
         determinant : ndarray, the broadcast shape, dimensionless
         """
-        f_theta, g_theta = self._split(theta)
+        f, g = self._split(theta)
         point = broadcast(u, v, x, y)
-        f_u, f_v = (polynomial(f_theta, self.f_terms, point, along) for along in (U, V))
-        g_u, g_v = (polynomial(g_theta, self.g_terms, point, along) for along in (U, V))
+        f_u, f_v = (polynomial(*f, point, along) for along in (U, V))
+        g_u, g_v = (polynomial(*g, point, along) for along in (U, V))
         return np.asarray((1.0 + f_u) * (1.0 + g_v) - f_v * g_u)
 
-    def image_position(self, theta: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
+    def image_position(
+        self, theta: ArrayLike, x: ArrayLike, y: ArrayLike, *, offset: ArrayLike = (0.0, 0.0)
+    ) -> tuple[Floats, Floats]:
         """Where the image of an object point stands.
 
-        It is the (u, v) with u - x + f = 0 and v - y + g = 0, found by Newton's method with the
-        analytic derivatives from (u, v) = (x, y).
+        It is the (u, v) with u - x + f = offset_x and v - y + g = offset_y, found by Newton's
+        method with the analytic derivatives from (x, y) + offset.
 
         Parameters
         ----------
@@ -273,16 +273,13 @@ class Polynomial:
             Coefficients.
         x, y : array_like, pixel
             Object points, broadcast against each other.
+        offset : array_like, shape (2,), pixel
+            The pointing: `offset_x` and `offset_y` of a posterior.
 
         Returns
         -------
         u, v : ndarray, the broadcast shape, pixel
             NaN where Newton's method does not converge.
-
-        Raises
-        ------
-        InputError
-            If `theta` does not have one value a term.
 
         Examples
         --------
@@ -293,84 +290,110 @@ class Polynomial:
         110.0 50.0
         """
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
-        equations = self._equations(theta, (U, V))
-        return newton(lambda u, v: equations((x, y, u, v)), x, y)
+        f, g = self._split(theta)
+        by_x, by_y = np.asarray(offset, dtype=float)
+
+        def equations(u: Floats, v: Floats) -> tuple[Floats, ...]:
+            point = (x, y, u, v)
+            return (
+                u - x - by_x + polynomial(*f, point),
+                v - y - by_y + polynomial(*g, point),
+                1.0 + polynomial(*f, point, U),
+                polynomial(*f, point, V),
+                polynomial(*g, point, U),
+                1.0 + polynomial(*g, point, V),
+            )
+
+        return newton(equations, x + by_x, y + by_y)
 
     def object_position(
-        self, theta: ArrayLike, u: ArrayLike, v: ArrayLike
+        self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, *, offset: ArrayLike = (0.0, 0.0)
     ) -> tuple[Floats, Floats]:
         """Which object point is imaged at (u, v): the inverse of `image_position`.
 
         Parameters
         ----------
-        theta : array_like, shape (n_terms,), pixel^(1 - degree)
-            Coefficients.
+        theta : array_like, shape (n_terms,) or (n, n_terms), pixel^(1 - degree)
+            Coefficients: of one distortion, or of n that resemble each other, such as draws of a
+            posterior.
         u, v : array_like, pixel
             Image points, broadcast against each other.
+        offset : array_like, shape (2,) or (n, 2), pixel
+            As for `image_position`.
 
         Returns
         -------
-        x, y : ndarray, the broadcast shape, pixel
-            NaN where Newton's method does not converge.
+        x, y : ndarray, the broadcast shape, after n if there are n, pixel
+            NaN where no object is imaged: beyond a fold of the map, seen from the axis.
 
         Raises
         ------
         InputError
             If `theta` does not have one value a term.
+
+        Examples
+        --------
+        >>> import bayesfred as bf
+        >>> field = bf.PolynomialDistortion([(2, 0, 0, 0)], [])
+        >>> x, y = field.object_position([[-1e-3], [0.0]], u=110.0, v=50.0)
+        >>> print(x, y)
+        [100. 110.] [50. 50.]
         """
         u, v = np.broadcast_arrays(np.asarray(u, dtype=float), np.asarray(v, dtype=float))
-        equations = self._equations(theta, (X, Y))
-        return newton(lambda x, y: equations((x, y, u, v)), u, v)
+        values = self.monomial_coefficients(theta)
+        f, g = self._parts(np.atleast_2d(values))
+        shifts = np.broadcast_to(np.asarray(offset, dtype=float), (len(f[0]), 2))
+        x, y = object_positions(f, g, u.ravel(), v.ravel(), shifts)
+        shape = (*values.shape[:-1], *u.shape)
+        return x.reshape(shape), y.reshape(shape)
 
-    def _equations(
-        self, theta: ArrayLike, unknowns: tuple[int, int]
-    ) -> Callable[[Point], tuple[Floats, ...]]:
-        """a, b and their derivatives a_p, a_q, b_p, b_q with respect to two of the variables."""
-        f_theta, g_theta = self._split(theta)
-        linear = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])  # of u - x and v - y
+    def displacement_jacobian(
+        self, theta: ArrayLike, u: Floats, v: Floats, *, offset: ArrayLike = (0.0, 0.0)
+    ) -> Floats:
+        """Derivatives of (u - x, v - y), the displacement of what is imaged at (u, v).
 
-        def equations(point: Point) -> tuple[Floats, ...]:
-            x, y, u, v = point
-            return (
-                u - x + polynomial(f_theta, self.f_terms, point),
-                v - y + polynomial(g_theta, self.g_terms, point),
-                *(linear[p, 0] + polynomial(f_theta, self.f_terms, point, p) for p in unknowns),
-                *(linear[p, 1] + polynomial(g_theta, self.g_terms, point, p) for p in unknowns),
-            )
+        Parameters
+        ----------
+        theta
+            As for `image_position`.
+        u, v : ndarray, shape (points,), pixel
+        offset
+            As for `image_position`.
 
-        return equations
+        Returns
+        -------
+        ndarray, shape (points, 2, n_terms + 2)
+            With respect to the coefficients, pixel per unit of each, and to the offset. NaN where
+            no object is imaged.
 
-    def _split(self, theta: ArrayLike) -> tuple[Floats, Floats]:
-        """The monomials' coefficients in f and in g, after a check of theta's shape."""
+        Examples
+        --------
+        >>> import bayesfred as bf
+        >>> scale = bf.PolynomialDistortion([(1, 0, 0, 0)], [])
+        >>> scale.displacement_jacobian([0.0], np.array([30.0]), np.array([7.0]))[:, 0]
+        array([[-30.,   1.,   0.]])
+        """
+        x, y = self.object_position(theta, u, v, offset=offset)
+        f, g = self._parts(np.atleast_2d(self.monomial_coefficients(theta)))
+        return displacement_jacobian(self.design_matrix(u, v, x, y), f, g, (u, v, x, y))
+
+    def _split(self, theta: ArrayLike) -> tuple[Terms, Terms]:
+        """The monomials of f and of g with their coefficients, after a check of theta's shape."""
         values = self.monomial_coefficients(theta)
         if values.ndim != 1:
             raise self._misshapen(values)
-        return values[: len(self.f_terms)], values[len(self.f_terms) :]
+        return self._parts(values)
+
+    def _parts(self, coefficients: Floats) -> tuple[Terms, Terms]:
+        """The coefficients of f and of g, each with its monomials."""
+        split = len(self.f_terms)
+        return (
+            (coefficients[..., :split], self.f_terms),
+            (coefficients[..., split:], self.g_terms),
+        )
 
     def _misshapen(self, values: Floats) -> InputError:
         return InputError(
             f"theta: got shape {values.shape}, expected ({self.n_terms},): one value each for "
             f"{', '.join(self.names)}"
         )
-
-
-def _checked_basis(basis: ArrayLike, monomials: int) -> Floats:
-    """A read-only copy of the matrix, or an InputError that says what is wrong with it."""
-    try:
-        checked = np.array(basis, dtype=np.float64, order="C")
-    except (TypeError, ValueError):
-        raise InputError("basis: got values that are not numbers, expected a matrix") from None
-    if checked.ndim != 2 or len(checked) != monomials or checked.shape[1] == 0:
-        raise InputError(
-            f"basis: got shape {checked.shape}, expected ({monomials}, number of coefficients): "
-            "one row for every monomial of f, then of g"
-        )
-    if not np.isfinite(checked).all():
-        raise InputError("basis: got values that are not finite, expected numbers")
-    if not checked.any(axis=0).all():
-        empty = int(np.argmin(checked.any(axis=0)))
-        raise InputError(
-            f"basis: got zeros alone in column {empty}, expected a monomial in every column"
-        )
-    checked.setflags(write=False)
-    return checked

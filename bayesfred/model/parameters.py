@@ -6,7 +6,7 @@ first, then the background, then what `Nuisances` leaves free. A new nuisance of
 row of `SOURCE_NUISANCES` and a field of the kernels' `Nuisance` tuple.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -261,6 +261,30 @@ def parameter_table(
         ),
         *background[1:],
     )  # fmt: skip
+
+
+def displacing(parameters: Sequence[Parameter], vectors: Floats) -> tuple[Floats, Floats]:
+    """The parts of parameter vectors that say where an object is imaged.
+
+    Parameters
+    ----------
+    parameters : sequence of Parameter, length d
+    vectors : ndarray, shape (d,) or (n, d)
+
+    Returns
+    -------
+    theta : ndarray, shape (n_terms,) or (n, n_terms)
+        The coefficients of the distortion.
+    offset : ndarray, shape (2,) or (n, 2), pixel
+        0 where the pointing is not a parameter.
+    """
+    names = [parameter.name for parameter in parameters]
+    theta = vectors[..., [k for k, p in enumerate(parameters) if p.kind == "distortion"]]
+    offset = np.zeros((*vectors.shape[:-1], 2))
+    for axis, name in enumerate(("offset_x", "offset_y")):
+        if name in names:
+            offset[..., axis] = vectors[..., names.index(name)]
+    return theta, offset
 
 
 def _distortion_terms(model: ForwardModel, context: _Context) -> list[Parameter]:

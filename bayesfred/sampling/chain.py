@@ -5,18 +5,22 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import arviz_base
+import numpy.typing as npt
 import xarray as xr
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.io.summary_table import Table
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.displacement import displacement
 from bayesfred.sampling.summary import summary
 
-__all__ = ["Chain"]
+__all__ = ["Chain", "Method"]
+
+Method = Literal["mcmc", "laplace"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +36,7 @@ class Chain:
     chain : ndarray, shape (n_ensembles, n_steps, n_walkers, d), parameter units
         Positions after every step, burn-in included.
     log_prob : ndarray, shape (n_ensembles, n_steps, n_walkers)
+        The posterior's log-density there; the approximation's where `method` is "laplace".
     accepted : ndarray, shape (n_ensembles, n_walkers)
         Number of accepted moves.
     random_states : tuple of tuple, length n_ensembles
@@ -48,6 +53,9 @@ class Chain:
         The number of effective draws that was asked for.
     n_invalid : int
         Number of log-probabilities that were NaN or +inf and were taken as -inf.
+    method : {"mcmc", "laplace"}
+        How the draws were made: by the sampler, or independently from the Laplace approximation,
+        see `laplace`.
     """
 
     path: Path | None
@@ -62,6 +70,7 @@ class Chain:
     versions: dict[str, str]
     target_ess: float = 1000.0
     n_invalid: int = 0
+    method: Method = "mcmc"
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -82,6 +91,46 @@ class Chain:
     def summary(self) -> Table:
         """What the draws say of every parameter, a row each, see `summary.summary`."""
         return summary(self)
+
+    def displacement(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Floats, Floats]:
+        """By how much the objects imaged at (u, v) are displaced, with the error of that.
+
+        Parameters
+        ----------
+        u, v : array_like, shape (n,), pixel of the fine grid
+            Image points from the middle of the frame.
+
+        Returns
+        -------
+        mean : ndarray, shape (n, 2), pixel of the fine grid
+            (u - x, v - y) of the object imaged at (u, v), the pointing's offset included. NaN where
+            no object is imaged.
+        covariance : ndarray, shape (n, 2, 2), pixel^2
+
+        Raises
+        ------
+        InputError
+            If the chain is of a density that is no frame's.
+
+        Notes
+        -----
+        At most 1,000 draws are used, evenly spaced; see
+        `bayesfred.sampling.displacement.displacement`.
+
+        Examples
+        --------
+        >>> import bayesfred as bf
+        >>> model = bf.ForwardModel(
+        ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
+        ...     bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]))
+        >>> posterior = bf.Posterior(model, bf.simulate(model, [0.02, 0.02], 2.0, seed=1))
+        >>> chain = bf.sample(posterior, seed=1, target_ess=200, progress=False)
+        >>> mean, covariance = chain.displacement([0.0, 30.0], [0.0, 30.0])
+        >>> print(mean.round(1), (covariance[:, 0, 0] ** 0.5).round(2))
+        [[ 0.   0. ]
+         [-0.6 -0.6]] [0.   0.02]
+        """
+        return displacement(self, u, v)
 
     def to_datatree(self) -> xr.DataTree:
         """The draws after burn-in for arviz.
