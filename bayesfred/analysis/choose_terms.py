@@ -65,6 +65,8 @@ class TermChoice:
     distortion : PolynomialDistortion
     posterior : Posterior
         The one that was given, with this distortion.
+    estimate : MapEstimate
+        Its maximum.
     tried : astropy.table.Table
         A row for each polynomial: `degree`; `n_terms`; `elpd` and `elpd_se`, its predictive
         accuracy with the standard error; `cost` and `cost_se`, by how much less than the chosen one
@@ -76,8 +78,22 @@ class TermChoice:
 
     distortion: PolynomialDistortion
     posterior: Posterior
+    estimate: MapEstimate
     tried: Table
     message: str
+
+    def lines(self) -> list[str]:
+        """What was tried, a line for each polynomial, and the message."""
+        return [
+            *(
+                f"degree {row['degree']}: {row['n_terms']} terms, predicts sources worse by "
+                f"{row['cost']:.1f} +- {row['cost_se']:.1f}, displaces images by up to "
+                f"{row['change']:.2g} pixel"
+                for row in self.tried
+                if row["n_terms"] != self.distortion.n_terms
+            ),
+            f"terms: {self.message}",
+        ]
 
 
 class _Fit(NamedTuple):
@@ -226,25 +242,33 @@ def _choice(tried: Sequence[_Fit], scores: Sequence[Floats], best: int, folds: F
             "change": change,
         }
     )
-    message = f"polynomial of degree {chosen.degree} ({distortion.n_terms} terms)"
+    return TermChoice(distortion, chosen.posterior, chosen.top, table, _message(table, best))
+
+
+def _message(tried: Table, best: int) -> str:
+    """What was chosen, what a leaner polynomial would cost, and why the search ended."""
+    degrees, chosen = tried["degree"], tried[best]
+    message = f"polynomial of degree {chosen['degree']} ({chosen['n_terms']} terms)"
     if best:
-        worse, error = cost[best - 1]
+        leaner = tried[int(np.nanargmin(tried["cost"][:best]))]
         message += (
-            f"; degree {chosen.degree - 1} would predict sources worse, by {worse:.1f} +- "
-            f"{error:.1f} in log predictive density, and displace images by up to "
-            f"{change[best - 1]:.2g} pixel"
+            f"; degree {leaner['degree']}, with {leaner['n_terms']} terms, would predict sources "
+            f"worse, by {leaner['cost']:.1f} +- {leaner['cost_se']:.1f} in log predictive density, "
+            f"and displace images by up to {leaner['change']:.2g} pixel"
         )
     else:
         message += ", the leanest one"
-    more = len(tried) - 1 - best
-    if more == 0 and chosen.degree == HIGHEST:
-        message += "; no higher degree is tried: give the terms of another distortion"
-    elif more < FAILURES and chosen.degree + more < HIGHEST:
-        message += f"; the frame does not determine degree {chosen.degree + more + 1}"
-    else:
-        degrees = " and ".join(str(fit.degree) for fit in tried[best + 1 :])
-        message += f"; degree {degrees} would not predict better"
-    return TermChoice(distortion, chosen.posterior, table, message)
+    if larger := [str(degree) for degree in degrees[best + 1 :]]:
+        plural = "s" if len(larger) > 1 else ""
+        message += f"; degree{plural} {' and '.join(larger)} would not predict better"
+    if len(larger) < FAILURES:
+        last = int(degrees[-1])
+        message += (
+            "; no higher degree is tried: name the terms of another distortion"
+            if last == HIGHEST
+            else f"; the frame does not determine degree {last + 1}"
+        )
+    return message
 
 
 def _largest_change(chosen: _Fit, other: _Fit, points: Floats) -> float:

@@ -41,7 +41,7 @@ A. Gelman, X.-L. Meng, H. Stern (1996), Statistica Sinica 6, 733: checks of a mo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ from scipy import linalg, stats
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats, Ints
+from bayesfred.analysis.agreement import Agreement, Verdict
 from bayesfred.analysis.folds import Folds, fold_sources
 from bayesfred.analysis.sources import source_table
 from bayesfred.errors import InputError
@@ -58,65 +59,12 @@ from bayesfred.optimize.find_map import CLOSENESS, find_map
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.moves import LaplaceMove
 
-__all__ = ["Agreement", "CrossCheck", "cross_check"]
+__all__ = ["CrossCheck", "cross_check"]
 
-Verdict = Literal["too small", "right", "too large"]
-
-SIGNIFICANCE = 0.01  # probability below or above which the halves do not agree
-POWER = 0.9
-LEVEL = 0.95  # of the interval of the factor
 KNOWN = 0.5  # share of what is known of a direction that the frame has to say
 SINGULAR = 1e-13  # eigenvalues of scaled information below this share of the largest are rounding
 HELD = 1e-4  # relative standard deviation of a parameter that is held
 FIELD = 0.99  # share of the field's expected mean square difference to be tested
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How well two halves agree, in units of their errors.
-
-    Attributes
-    ----------
-    chi2 : float
-        Sum of squared differences in units of their standard deviations.
-    dof : int
-        Degrees of freedom.
-    p : float
-        Probability of a larger chi-square if the errors are right.
-    """
-
-    chi2: float
-    dof: int
-    p: float
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the errors are too small, right or too large: p outside 0.01 to 0.99 says so."""
-        if self.p < SIGNIFICANCE:
-            return "too small"
-        return "too large" if self.p > 1.0 - SIGNIFICANCE else "right"
-
-    @property
-    def factor(self) -> float:
-        """By what the errors are to be multiplied, as estimated: the root of chi2 / dof."""
-        return float(np.sqrt(self.chi2 / self.dof))
-
-    @property
-    def factor_interval(self) -> tuple[float, float]:
-        """The 95 % confidence interval of the factor."""
-        tail = 0.5 * (1.0 - LEVEL)
-        low, high = (self.chi2 / stats.chi2.isf(q, self.dof) for q in (tail, 1.0 - tail))
-        return float(np.sqrt(low)), float(np.sqrt(high))
-
-    @property
-    def detectable(self) -> float:
-        """Factor by which errors must be too small to be found with probability 0.9.
-
-        The statistic is then the factor's square times a chi-square variable, which exceeds the
-        critical value with that probability.
-        """
-        critical = stats.chi2.isf(SIGNIFICANCE, self.dof)
-        return float(np.sqrt(critical / stats.chi2.isf(POWER, self.dof)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +147,8 @@ class CrossCheck:
         """The findings as numbers and texts by name, as `bayesfred crosscheck --json` prints them.
 
         Each agreement has `p`, `chi2`, `dof`, `factor`, `factor_low`, `factor_high` and
-        `detectable`.
+        `detectable`; of the positions in each half there is the root mean square in standard
+        deviations.
         """
         record: dict[str, Any] = {"verdict": self.verdict, "message": self.message}
         for name, a in (("displacement", self.displacement), ("coefficients", self.coefficients)):
@@ -209,6 +158,7 @@ class CrossCheck:
                 "factor_high": high, "detectable": a.detectable,
             }  # fmt: skip
             record |= {f"{name}_{key}": value for key, value in numbers.items()}
+        record["positions_rms_z"] = [a.factor for a in self.positions]
         record["displacement_rms"] = self.displacement_rms
         record["displacement_expected"] = self.displacement_expected
         return record
@@ -287,8 +237,8 @@ def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) ->
         share = np.cumsum(spread**2) / np.sum(spread**2)
         kept = components[: int(np.searchsorted(share, FIELD)) + 1]
         return CrossCheck(
-            displacement=_agreement(kept @ z),
-            coefficients=_agreement(z),
+            displacement=Agreement.of(kept @ z),
+            coefficients=Agreement.of(z),
             positions=(
                 _predicted(folds.only(fixed, 0), two, folds.sources == 0),
                 _predicted(folds.only(fixed, 1), one, folds.sources == 1),
@@ -298,11 +248,6 @@ def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) ->
             sources=folds.sources,
             params=np.array([one.params, two.params]),
         )
-
-
-def _agreement(z: Floats) -> Agreement:
-    chi2 = float(z @ z)
-    return Agreement(chi2, z.size, float(stats.chi2.sf(chi2, z.size)))
 
 
 def _scatter_fixed(posterior: Posterior, whole: MapEstimate) -> tuple[Posterior, Floats]:
@@ -392,7 +337,7 @@ def _predicted(half: Posterior, other: _Half, sources: Flags) -> Agreement:
     )
     found = np.isfinite(u + v + du + dv)
     if not found.any():
-        return Agreement(0.0, 0, np.nan)
+        return Agreement.of(np.empty(0))
     free = ~np.isin(half.parameter_names, half.hyperparameters)
     names = np.array(half.parameter_names)[free]
     information = other.information + half.prior_information(other.params)
@@ -403,7 +348,7 @@ def _predicted(half: Posterior, other: _Half, sources: Flags) -> Agreement:
     errors += named.get("position_scatter", 0.0) ** 2
     lower = linalg.cholesky(field @ covariance @ field.T + np.diag(errors), lower=True)
     away = np.concatenate([du[found], dv[found]])
-    return _agreement(linalg.solve_triangular(lower, away, lower=True))
+    return Agreement.of(linalg.solve_triangular(lower, away, lower=True))
 
 
 def _field(posterior: Posterior, params: Floats, points: Floats) -> Floats:
