@@ -154,7 +154,7 @@ def cross_check_table(found: CrossCheck) -> Table:
     -------
     rich.table.Table
     """
-    table = _table("halves agree in", "chi-square", "dof", "p", "errors times", "found from")
+    table = _table("halves agree in", "chi2", "dof", "p", "errors times", "found from")
     rows = {
         "displacement": found.displacement,
         "coefficients": found.coefficients,
