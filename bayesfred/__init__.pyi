@@ -1,4 +1,5 @@
 from . import commands, show
+from .analysis.choose_terms import TermChoice, choose_terms
 from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
 from .analysis.diagnostics import Diagnostics, diagnose
@@ -51,7 +52,9 @@ __all__ = [
     "RunRecord",
     "SampledPSF",
     "SourceCatalog",
+    "TermChoice",
     "calibrate_posterior",
+    "choose_terms",
     "commands",
     "compare",
     "correct_sampling",

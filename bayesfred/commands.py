@@ -216,6 +216,11 @@ def study(
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
+    if run.distortion.terms == "choose":
+        raise InputError(
+            f"{run_file}: distortion.terms: got 'choose', expected the terms themselves: a study "
+            "is of one model"
+        )
     s, simulation = run.study or settings.StudySettings(), run.simulation
     kind = kind or s.kind
     given = s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv")

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesfred import build, settings
 from bayesfred._typing import Floats
+from bayesfred.analysis.choose_terms import choose_terms
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.field import DisplacementField, displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
@@ -182,7 +183,7 @@ class Job:
 def read_frame(
     run: settings.RunSettings, run_file: Path, say: Say | None
 ) -> tuple[Posterior, MapEstimate | None, list[str]]:
-    """Read the frame of a run file, and reject outliers if it asks for that.
+    """Read the frame of a run file; reject outliers and choose terms if it asks for that.
 
     Parameters
     ----------
@@ -195,9 +196,9 @@ def read_frame(
     -------
     posterior : Posterior
     estimate : MapEstimate or None
-        Its maximum, if outliers were rejected.
+        Its maximum, if outliers were rejected or terms chosen.
     notes : list of str
-        What was read, and what was removed.
+        What was read, what was removed, and what was chosen.
 
     Raises
     ------
@@ -224,17 +225,29 @@ def read_frame(
     with naming(run_file):
         model = build.forward_model(run, shape, sources, psf)
         posterior = build.posterior_given(run, model, frame.counts, frame.valid)
-        if not f.reject_outliers:
-            return posterior, None, notes
-        with searching() if say else nullcontext():
-            kept, estimate = reject_outliers(posterior)
-    unmatched = len(sources) - len(kept.model.sources)
+        estimate = None
+        if f.reject_outliers:
+            with searching() if say else nullcontext():
+                kept, estimate = reject_outliers(posterior)
+            note(_census(posterior, kept))
+            posterior = kept
+        if run.distortion.terms == "choose":
+            with searching() if say else nullcontext():
+                choice = choose_terms(posterior)
+            posterior, estimate = choice.posterior, choice.estimate
+            for line in choice.lines():
+                note(line)
+    return posterior, estimate, notes
+
+
+def _census(posterior: Posterior, kept: Posterior) -> str:
+    """How many sources and pixels of a posterior were rejected as outliers."""
+    number = len(posterior.model.sources)
     masked = int(np.sum(posterior.mask & ~kept.mask))
-    note(
-        f"outliers: {unmatched} unmatched of {len(sources)} sources removed, {masked} of "
-        f"{posterior.mask.sum()} pixels masked"
+    return (
+        f"outliers: {number - len(kept.model.sources)} unmatched of {number} sources removed, "
+        f"{masked} of {posterior.mask.sum()} pixels masked"
     )
-    return kept, estimate, notes
 
 
 def fit_frame(

@@ -3,6 +3,7 @@
 The keys of such a section are the fields of a class: :func:`described` makes the pydantic model of
 the section from the class, and the class checks the values. So a new PSF family or noise model,
 registered with `bayesfred.io.serialize`, can be named in a run file without a change here.
+`[distortion]`, which names or lists terms, has a model of its own.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ import bayesfred.imaging.psf  # noqa: F401
 import bayesfred.model.noise  # noqa: F401
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.io.serialize import kinds
 from bayesfred.model.parameters import Nuisances
 
 __all__ = [
     "TOO_DEEP",
+    "DistortionSettings",
     "Float",
     "Name",
     "ObjectSettings",
@@ -45,6 +48,15 @@ LARGEST = 1e15
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Float = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Integer = Annotated[int, Field(ge=-(10**15), le=10**15)]
+
+_Power = Annotated[int, Field(ge=0, le=10)]
+_Term = tuple[_Power, _Power, _Power, _Power]
+_Basis = Literal[
+    "mirrored", "paper", "pinhole", "radial_tangential", "polynomial", "full_polynomial", "zernike",
+    "choose",
+]  # fmt: skip
+_WITH_DEGREE = ("polynomial", "full_polynomial", "zernike")
+FIRST_CHOICE = 3  # degree of the polynomial with which outliers are rejected before one is chosen
 
 TOO_DEEP = "got tables or arrays nested too deeply, expected sections of key = value"
 
@@ -62,6 +74,65 @@ class Section(BaseModel):
 
     # strict: TOML has types of its own, so 'true' or '3' is never taken for a number.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class DistortionSettings(Section):
+    """`[distortion]`: the terms of f and g, named as a basis or listed.
+
+    Attributes
+    ----------
+    terms : str, optional
+        A basis by name: a constructor of `PolynomialDistortion`; or 'choose': the polynomial that
+        `bayesfred.choose_terms` chooses.
+    degree : int, optional
+        Highest degree of a 'polynomial', 'full_polynomial' or 'zernike' basis.
+    f_terms, g_terms : tuple of (i, j, m, n), optional
+        Powers of x, y, u, v, one entry a term.
+    """
+
+    terms: _Basis | None = None
+    degree: Annotated[int, Field(ge=1, le=10)] | None = None
+    f_terms: tuple[_Term, ...] | None = None
+    g_terms: tuple[_Term, ...] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> DistortionSettings:
+        given = [key for key in ("terms", "f_terms", "g_terms") if getattr(self, key) is not None]
+        if given not in (["terms"], ["f_terms", "g_terms"]):
+            got = " and ".join(given) or "no terms"
+            raise ValueError(f"got {got}, expected either terms, or both f_terms and g_terms")
+        if self.terms in _WITH_DEGREE and self.degree is None:
+            raise ValueError(f"got no degree, expected one with terms = {self.terms!r}")
+        if self.terms not in _WITH_DEGREE and self.degree is not None:
+            names = " or ".join(map(repr, _WITH_DEGREE))
+            raise ValueError(f"got degree {self.degree}, expected it with terms = {names} only")
+        if not self.terms and not self.f_terms and not self.g_terms:
+            raise ValueError("got f_terms and g_terms empty, expected at least one term")
+        self.make(1.0)
+        return self
+
+    def make(self, radius: float) -> PolynomialDistortion:
+        """Make the distortion.
+
+        Parameters
+        ----------
+        radius : float, pixel
+            Half the frame's diagonal, for the bases that need a unit of length.
+
+        Raises
+        ------
+        InputError
+            A term is not allowed, or the degree is too low.
+        """
+        if self.terms == "choose":  # to begin with
+            return PolynomialDistortion.polynomial(FIRST_CHOICE)
+        if self.terms is None:
+            return PolynomialDistortion(self.f_terms or (), self.g_terms or ())
+        keywords: dict[str, Any] = {} if self.degree is None else {"degree": self.degree}
+        if self.terms == "zernike":
+            keywords["radius"] = radius
+        made: PolynomialDistortion = getattr(PolynomialDistortion, self.terms)(**keywords)
+        return made
 
 
 class ObjectSettings(Section):

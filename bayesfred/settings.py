@@ -19,28 +19,29 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_v
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
-from bayesfred.imaging.distortion import PolynomialDistortion
-from bayesfred.sections import LARGEST, TOO_DEEP, Float, Name, Section, described, mistake
+from bayesfred.sections import (
+    LARGEST,
+    TOO_DEEP,
+    DistortionSettings,
+    Float,
+    Name,
+    Section,
+    described,
+    mistake,
+)
 
 __all__ = ["PriorSettings", "RunSettings", "read_settings"]
 
 _Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 _NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 _Count = Annotated[int, Field(ge=1, le=10**15)]
-_Power = Annotated[int, Field(ge=0, le=10)]
 _Seed = Annotated[int, Field(ge=0, lt=2**63)]
-_Term = tuple[_Power, _Power, _Power, _Power]
 
 # Sections with the fields of a class: `ObjectSettings`.
 _Detector = Annotated[Any, PlainValidator(partial(described, "detector"))]
 _PSF = Annotated[Any, PlainValidator(partial(described, "psf"))]
 _Noise = Annotated[Any, PlainValidator(partial(described, "noise"))]
 _Nuisances = Annotated[Any, PlainValidator(partial(described, "nuisances"))]
-
-_Basis = Literal[
-    "mirrored", "paper", "pinhole", "radial_tangential", "polynomial", "full_polynomial", "zernike"
-]
-_WITH_DEGREE = ("polynomial", "full_polynomial", "zernike")
 
 
 class FrameSettings(Section):
@@ -101,62 +102,6 @@ class CatalogueSettings(Section):
             given = "magnitude" if self.zero_point is None else "zero_point"
             raise ValueError(f"got {given} alone, expected magnitude and zero_point together")
         return self
-
-
-class DistortionSettings(Section):
-    """`[distortion]`: the terms of f and g, named as a basis or listed.
-
-    Attributes
-    ----------
-    terms : str, optional
-        A basis by name: a constructor of `PolynomialDistortion`.
-    degree : int, optional
-        Highest degree of a 'polynomial', 'full_polynomial' or 'zernike' basis.
-    f_terms, g_terms : tuple of (i, j, m, n), optional
-        Powers of x, y, u, v, one entry a term.
-    """
-
-    terms: _Basis | None = None
-    degree: Annotated[int, Field(ge=1, le=10)] | None = None
-    f_terms: tuple[_Term, ...] | None = None
-    g_terms: tuple[_Term, ...] | None = None
-
-    @model_validator(mode="after")
-    def _one_way(self) -> DistortionSettings:
-        given = [key for key in ("terms", "f_terms", "g_terms") if getattr(self, key) is not None]
-        if given not in (["terms"], ["f_terms", "g_terms"]):
-            got = " and ".join(given) or "no terms"
-            raise ValueError(f"got {got}, expected either terms, or both f_terms and g_terms")
-        if self.terms in _WITH_DEGREE and self.degree is None:
-            raise ValueError(f"got no degree, expected one with terms = {self.terms!r}")
-        if self.terms not in _WITH_DEGREE and self.degree is not None:
-            names = " or ".join(map(repr, _WITH_DEGREE))
-            raise ValueError(f"got degree {self.degree}, expected it with terms = {names} only")
-        if not self.terms and not self.f_terms and not self.g_terms:
-            raise ValueError("got f_terms and g_terms empty, expected at least one term")
-        self.make(1.0)
-        return self
-
-    def make(self, radius: float) -> PolynomialDistortion:
-        """Make the distortion.
-
-        Parameters
-        ----------
-        radius : float, pixel
-            Half the frame's diagonal, for the bases that need a unit of length.
-
-        Raises
-        ------
-        InputError
-            A term is not allowed, or the degree is too low.
-        """
-        if self.terms is None:
-            return PolynomialDistortion(self.f_terms or (), self.g_terms or ())
-        keywords: dict[str, Any] = {} if self.degree is None else {"degree": self.degree}
-        if self.terms == "zernike":
-            keywords["radius"] = radius
-        made: PolynomialDistortion = getattr(PolynomialDistortion, self.terms)(**keywords)
-        return made
 
 
 class ModelSettings(Section):

@@ -41,81 +41,30 @@ A. Gelman, X.-L. Meng, H. Stern (1996), Statistica Sinica 6, 733: checks of a mo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import linalg, stats
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats, Ints
+from bayesfred.analysis.agreement import Agreement, Verdict
 from bayesfred.analysis.folds import Folds, fold_sources
+from bayesfred.analysis.sources import source_table
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.optimize.find_map import CLOSENESS, find_map
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.moves import LaplaceMove
 
-__all__ = ["Agreement", "CrossCheck", "cross_check"]
+__all__ = ["CrossCheck", "cross_check"]
 
-Verdict = Literal["too small", "right", "too large"]
-
-SIGNIFICANCE = 0.01  # probability below or above which the halves do not agree
-POWER = 0.9
-LEVEL = 0.95  # of the interval of the factor
 KNOWN = 0.5  # share of what is known of a direction that the frame has to say
 SINGULAR = 1e-13  # eigenvalues of scaled information below this share of the largest are rounding
 HELD = 1e-4  # relative standard deviation of a parameter that is held
 FIELD = 0.99  # share of the field's expected mean square difference to be tested
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How well two halves agree, in units of their errors.
-
-    Attributes
-    ----------
-    chi2 : float
-        Sum of squared differences in units of their standard deviations.
-    dof : int
-        Degrees of freedom.
-    p : float
-        Probability of a larger chi-square if the errors are right.
-    """
-
-    chi2: float
-    dof: int
-    p: float
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the errors are too small, right or too large: p outside 0.01 to 0.99 says so."""
-        if self.p < SIGNIFICANCE:
-            return "too small"
-        return "too large" if self.p > 1.0 - SIGNIFICANCE else "right"
-
-    @property
-    def factor(self) -> float:
-        """By what the errors are to be multiplied, as estimated: the root of chi2 / dof."""
-        return float(np.sqrt(self.chi2 / self.dof))
-
-    @property
-    def factor_interval(self) -> tuple[float, float]:
-        """The 95 % confidence interval of the factor."""
-        tail = 0.5 * (1.0 - LEVEL)
-        low, high = (self.chi2 / stats.chi2.isf(q, self.dof) for q in (tail, 1.0 - tail))
-        return float(np.sqrt(low)), float(np.sqrt(high))
-
-    @property
-    def detectable(self) -> float:
-        """Factor by which errors must be too small to be found with probability 0.9.
-
-        The statistic is then the factor's square times a chi-square variable, which exceeds the
-        critical value with that probability.
-        """
-        critical = stats.chi2.isf(SIGNIFICANCE, self.dof)
-        return float(np.sqrt(critical / stats.chi2.isf(POWER, self.dof)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +77,9 @@ class CrossCheck:
         Of the displacement field over the frame.
     coefficients : Agreement
         Of the distortion's coefficients and the pointing.
+    positions : tuple of Agreement
+        Of the image positions found in each half with those that the other half's fit predicts;
+        `factor` is the weighted root mean square of the differences in standard deviations.
     displacement_rms, displacement_expected : float, pixel
         Root mean square difference of the halves' displacements over the field along each axis, and
         what it is expected to be if the errors are right.
@@ -139,6 +91,7 @@ class CrossCheck:
 
     displacement: Agreement
     coefficients: Agreement
+    positions: tuple[Agreement, Agreement]
     displacement_rms: float
     displacement_expected: float
     sources: Ints
@@ -194,7 +147,8 @@ class CrossCheck:
         """The findings as numbers and texts by name, as `bayesfred crosscheck --json` prints them.
 
         Each agreement has `p`, `chi2`, `dof`, `factor`, `factor_low`, `factor_high` and
-        `detectable`.
+        `detectable`; of the positions in each half there is the root mean square in standard
+        deviations.
         """
         record: dict[str, Any] = {"verdict": self.verdict, "message": self.message}
         for name, a in (("displacement", self.displacement), ("coefficients", self.coefficients)):
@@ -204,6 +158,7 @@ class CrossCheck:
                 "factor_high": high, "detectable": a.detectable,
             }  # fmt: skip
             record |= {f"{name}_{key}": value for key, value in numbers.items()}
+        record["positions_rms_z"] = [a.factor for a in self.positions]
         record["displacement_rms"] = self.displacement_rms
         record["displacement_expected"] = self.displacement_expected
         return record
@@ -263,36 +218,36 @@ def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) ->
     with threadpool_limits(1, user_api="blas"):
         whole = estimate or find_map(posterior)
         folds = fold_sources(posterior, whole.params, 2)
-        if not (folds.sources == 1).any():
+        n_sources = int(np.sum(folds.sources >= 0))
+        if n_sources < 2:
             raise InputError(
-                f"catalogue: got {int(np.sum(folds.sources >= 0))} sources with an image in the "
-                "frame, expected at least 2 to make halves of: check positions and mask"
+                f"catalogue: got {n_sources} sources with an image in the frame, expected at least "
+                "2 to make halves of: check positions and mask"
             )
         fixed, start = _scatter_fixed(posterior, whole)
-        halves = [_fitted(fixed, folds, k, start) for k in (0, 1)]
-    z, directions = _difference(fixed, halves, start)
-    if not z.size:
-        raise InputError(
-            f"catalogue: got {int(np.sum(folds.sources >= 0))} sources, of which neither half "
-            "determines any coefficient, expected more: fit fewer terms"
+        one, two = (_fitted(fixed, folds, k, start) for k in (0, 1))
+        z, directions = _difference(fixed, (one, two), start)
+        if not z.size:
+            raise InputError(
+                f"catalogue: got {n_sources} sources, half of which determine no coefficient, "
+                "expected more: fit fewer terms"
+            )
+        field = _field(posterior, whole.params, folds.points) @ directions
+        _, spread, components = np.linalg.svd(field / np.sqrt(len(field)), full_matrices=False)
+        share = np.cumsum(spread**2) / np.sum(spread**2)
+        kept = components[: int(np.searchsorted(share, FIELD)) + 1]
+        return CrossCheck(
+            displacement=Agreement.of(kept @ z),
+            coefficients=Agreement.of(z),
+            positions=(
+                _predicted(folds.only(fixed, 0), two, folds.sources == 0),
+                _predicted(folds.only(fixed, 1), one, folds.sources == 1),
+            ),
+            displacement_rms=float(np.sqrt(np.mean((field @ z) ** 2))),
+            displacement_expected=float(np.sqrt(np.sum(spread**2))),
+            sources=folds.sources,
+            params=np.array([one.params, two.params]),
         )
-    field = _field(posterior, whole.params, folds.points) @ directions
-    _, spread, components = np.linalg.svd(field / np.sqrt(len(field)), full_matrices=False)
-    share = np.cumsum(spread**2) / np.sum(spread**2)
-    kept = components[: int(np.searchsorted(share, FIELD)) + 1]
-    return CrossCheck(
-        displacement=_agreement(kept @ z),
-        coefficients=_agreement(z),
-        displacement_rms=float(np.sqrt(np.mean((field @ z) ** 2))),
-        displacement_expected=float(np.sqrt(np.sum(spread**2))),
-        sources=folds.sources,
-        params=np.array([half.params for half in halves]),
-    )
-
-
-def _agreement(z: Floats) -> Agreement:
-    chi2 = float(z @ z)
-    return Agreement(chi2, z.size, float(stats.chi2.sf(chi2, z.size)))
 
 
 def _scatter_fixed(posterior: Posterior, whole: MapEstimate) -> tuple[Posterior, Floats]:
@@ -367,6 +322,33 @@ def _are_coefficients(posterior: Posterior, names: NDArray[np.str_]) -> Flags:
     """Which parameters move images: the distortion's terms and the pointing."""
     terms = (*posterior.model.distortion.names, "offset_x", "offset_y")
     return np.isin(names, terms)
+
+
+def _predicted(half: Posterior, other: _Half, sources: Flags) -> Agreement:
+    """How well the other half's fit predicts where this half's sources are found.
+
+    The positions' errors are those of each source's counts, and of its place in the catalogue where
+    positions scatter. They are independent of the prediction's, which all sources share.
+    """
+    named = dict(zip(half.parameter_names, other.params, strict=True))
+    table, step = source_table(half, other.params)[sources], half.model.detector.binning
+    u, v, du, dv, du_sd, dv_sd = (
+        np.array(table[name]) * step for name in ("u", "v", "du", "dv", "du_sd", "dv_sd")
+    )
+    found = np.isfinite(u + v + du + dv)
+    if not found.any():
+        return Agreement.of(np.empty(0))
+    free = ~np.isin(half.parameter_names, half.hyperparameters)
+    names = np.array(half.parameter_names)[free]
+    information = other.information + half.prior_information(other.params)
+    wanted = _are_coefficients(half, names)
+    covariance = inverse(information[np.ix_(free, free)])[np.ix_(wanted, wanted)]
+    field = _field(half, other.params, np.column_stack([u, v])[found])
+    errors = np.concatenate([du_sd[found], dv_sd[found]]) ** 2
+    errors += named.get("position_scatter", 0.0) ** 2
+    lower = linalg.cholesky(field @ covariance @ field.T + np.diag(errors), lower=True)
+    away = np.concatenate([du[found], dv[found]])
+    return Agreement.of(linalg.solve_triangular(lower, away, lower=True))
 
 
 def _field(posterior: Posterior, params: Floats, points: Floats) -> Floats:

@@ -23,7 +23,7 @@ from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.kernels.geometry import image_positions
 from bayesfred.model.posterior import Posterior
 
-GRID = 33  # points along each axis of the frame at which fields are compared
+GRID = 17  # points along each axis of the frame at which fields are compared
 
 
 @dataclass(frozen=True, eq=False)

@@ -165,10 +165,16 @@ def cross_check_table(found: CrossCheck) -> Table:
     -------
     rich.table.Table
     """
-    table = _table("halves agree in", "chi-square", "dof", "p", "errors times", "found from")
-    for name, a in (("displacement", found.displacement), ("coefficients", found.coefficients)):
+    table = _table("halves agree in", "chi2", "dof", "p", "errors times", "found from")
+    rows = {
+        "displacement": found.displacement,
+        "coefficients": found.coefficients,
+        "positions, half 1": found.positions[0],
+        "positions, half 2": found.positions[1],
+    }
+    for name, a in rows.items():
         low, high = a.factor_interval
-        scaling = f"{a.factor:.2f} ({low:.2f} to {high:.2f})"
+        scaling = f"{a.factor:.2f} ({low:.2f}-{high:.2f})"
         table.add_row(
             name, f"{a.chi2:.1f}", str(a.dof), f"{a.p:.2g}", scaling, f"{a.detectable:.2f}"
         )
