@@ -212,6 +212,10 @@ class BackgroundNoise(_Gaussian):
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
         return np.ones_like(mean) / background
 
+    def deviance_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        """Of counts that are Poisson, not Gaussian."""
+        return (2.0 + 1.0 / background) * np.ones_like(mean)
+
     def pearson_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Of counts that are Poisson, fitted as a Gaussian: see `optimize/fit_statistics`."""
         return 2.0 * np.ones_like(mean) * (background / (background + 0.5)) ** 2

@@ -76,6 +76,10 @@ class Noise(Protocol):
         ones = np.ones_like(mean)
         return ones, self.pearson_variance(mean, background), 0.0 * ones
 
+    def deviance_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        """Variance of the unit deviance for a background that is known."""
+        return self.deviance_moments(mean, background)[1]
+
     def pearson_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Variance of a squared residual, less what a fitted background explains of it."""
         return 2.0 * np.ones_like(mean)
