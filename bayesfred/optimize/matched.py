@@ -51,6 +51,10 @@ class SourceLight:
         Square of the signal to noise of the light that the model has; 0 outside.
     ratio : ndarray, shape (n,)
         Light found over light of the model; nan outside.
+    displacement : ndarray, shape (n, 2), recorded pixel
+        Of the matched sources' light from their images, along u and v; nan elsewhere.
+    displacement_sd : ndarray, shape (n,), recorded pixel
+        Its standard deviation along either axis.
     """
 
     position: Floats
@@ -59,6 +63,8 @@ class SourceLight:
     matched: Flags
     power: Floats
     ratio: Floats
+    displacement: Floats
+    displacement_sd: Floats
 
     @property
     def pooled(self) -> float:
@@ -115,11 +121,15 @@ def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     inside = (covered > COVERED) & np.isfinite(own) & (own > 0.0)
     with np.errstate(all="ignore"):
         ratio = np.where(inside, light / own, np.nan)
-        shown = inside & (light > SIGNIFICANCE * noise) & (ratio > FAINTEST)
         # s^2 grad M is the sum of the offsets, weighted
-        matched = shown & (2.0 * np.hypot(along_u, along_v) < FARTHEST * s * light)
+        displacement = 2.0 * np.stack([along_u, along_v], axis=1) / light[:, None]
+        matched = inside & (light > SIGNIFICANCE * noise) & (ratio > FAINTEST)
+        matched &= np.hypot(*displacement.T) < FARTHEST * s
+        # the slope of G has half the integral of its square over s^2
+        displacement_sd = np.where(matched, 2.0**0.5 * s * noise / light, np.nan)
+    displacement[~matched] = np.nan
     power = np.where(inside, (own / noise) ** 2, 0.0)
-    return SourceLight(position, s, inside, matched, power, ratio)
+    return SourceLight(position, s, inside, matched, power, ratio, displacement, displacement_sd)
 
 
 def _filtered(
