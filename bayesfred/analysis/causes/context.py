@@ -157,7 +157,7 @@ class Context:
 
     @cached_property
     def _nearest(self) -> tuple[Floats, Ints]:
-        """Distance of every pixel from the nearest image, pixel, and whose it is; -1 if nobody's."""
+        """Every pixel's distance from the nearest image, pixel, and whose that is, or -1."""
         shape = self.expected.shape
         index = np.full(shape, -1)
         position = self.light.position
@@ -184,7 +184,9 @@ class Context:
     def per_source(self, image: Floats, radius: float = CORE) -> Floats:
         """Sum of an image over every source's used pixels, shape (n,)."""
         near = self.used & (self.distance <= radius * self.light.width)
-        return np.bincount(self.owner[near], image[near], self.flux.size)
+        return np.asarray(
+            np.bincount(self.owner[near], image[near], self.flux.size), dtype=np.float64
+        )
 
     @cached_property
     def source_pixels(self) -> Floats:

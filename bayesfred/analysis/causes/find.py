@@ -65,7 +65,8 @@ def find_causes(posterior: Posterior, params: Floats) -> tuple[Cause, ...]:
 def _ranked(findings: list[Finding], total: float) -> tuple[Cause, ...]:
     """Causes by what they explain, each with a share that none before has claimed."""
     rest = list(findings)
-    left, causes = 1.0, []
+    left = 1.0
+    causes: list[Cause] = []
     while rest:
         best = max(rest, key=lambda f: f.weight * f.explained)
         rest = [
@@ -74,7 +75,7 @@ def _ranked(findings: list[Finding], total: float) -> tuple[Cause, ...]:
             if f is not best
         ]
         share = float(min(best.explained / max(total, 1e-300), left))
-        if share < LEAST and causes or best.explained <= 0.0:
+        if (share < LEAST and causes) or best.explained <= 0.0:
             continue
         left -= share
         causes.append(replace(best.cause, share=share))
