@@ -17,6 +17,7 @@ from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
 from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
+from .sampling.laplace import laplace
 from .sampling.moves import LaplaceMove
 from .sampling.sampler import sample
 
@@ -48,6 +49,7 @@ __all__ = [
     "correct_sampling",
     "diagnose",
     "find_map",
+    "laplace",
     "noise_study",
     "open_chain",
     "reject_outliers",

@@ -32,6 +32,10 @@ ChainFile = Annotated[
     Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+MapOnly = Annotated[
+    bool,
+    typer.Option("--map-only", help="Do not sample: maximum, and errors from the information."),
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the output file.")]
 
 
@@ -49,12 +53,13 @@ def demo(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the simulated frame and of the sampler.")
     ] = 1,
+    map_only: MapOnly = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 terms, Poisson counts."""
     _run(
         lambda: bf.show.show_run(
-            bf.commands.demo(folder, seed=seed, overwrite=overwrite, say=print)
+            bf.commands.demo(folder, seed=seed, map_only=map_only, overwrite=overwrite, say=print)
         )
     )
 
@@ -66,11 +71,15 @@ def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
 
 
 @app.command(epilog="A complete run file:\n\n" + _example())
-def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
+def fit(
+    run_file: Run, map_only: MapOnly = False, resume: Resume = False, overwrite: Overwrite = False
+) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
     _run(
         lambda: bf.show.show_run(
-            bf.commands.fit(run_file, resume=resume, overwrite=overwrite, say=print)
+            bf.commands.fit(
+                run_file, map_only=map_only, resume=resume, overwrite=overwrite, say=print
+            )
         )
     )
 

@@ -37,7 +37,12 @@ DEMO_NOTE = (
 
 
 def demo(
-    folder: PathLike, *, seed: int = 1, overwrite: bool = False, say: Say | None = None
+    folder: PathLike,
+    *,
+    seed: int = 1,
+    map_only: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result:
     """Simulate the frame of the example run file, which is the paper's, and fit it.
 
@@ -47,6 +52,8 @@ def demo(
         Where demo.h5 goes; created if it does not exist.
     seed : int
         Seed of the frame and of the sampler.
+    map_only : bool
+        Do not sample, see `fit`.
     overwrite : bool
         Replace an earlier demo.
     say : callable, optional
@@ -68,7 +75,7 @@ def demo(
     run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
-    return pipeline.fit_frame(job, posterior, overwrite=overwrite, say=say)
+    return pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
@@ -114,7 +121,12 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
 
 
 def fit(
-    run_file: PathLike, *, resume: bool = False, overwrite: bool = False, say: Say | None = None
+    run_file: PathLike,
+    *,
+    map_only: bool = False,
+    resume: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result:
     """Fit the frame of a run file: MAP, draws, diagnostics, report.
 
@@ -122,6 +134,8 @@ def fit(
     ----------
     run_file : path-like
         TOML, see `bayesfred fit --help`.
+    map_only : bool
+        Do not sample: draw from the Laplace approximation at the maximum, see `bf.laplace`.
     resume : bool
         Resume the run in the output file.
     overwrite : bool
@@ -153,7 +167,9 @@ def fit(
     if run.output.path is None:
         pipeline.make_folder(output)
     job = pipeline.Job(run, run_file, output, notes)
-    return pipeline.fit_frame(job, posterior, estimate, resume=resume, overwrite=overwrite, say=say)
+    return pipeline.fit_frame(
+        job, posterior, estimate, map_only=map_only, resume=resume, overwrite=overwrite, say=say
+    )
 
 
 def study(

@@ -28,6 +28,7 @@ from bayesfred.reporting.html import page_figures, write_report
 from bayesfred.reporting.posteriors import overview
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.laplace import laplace
 from bayesfred.sampling.sampler import sample, searching
 from bayesfred.sampling.summary import summary
 
@@ -225,9 +226,10 @@ def fit_frame(
     *,
     resume: bool = False,
     overwrite: bool,
+    map_only: bool = False,
     say: Say | None,
 ) -> Result:
-    """Find the maximum, sample, and write the results.
+    """Find the maximum, sample or draw from the Laplace approximation, and write the results.
 
     Parameters
     ----------
@@ -237,6 +239,8 @@ def fit_frame(
         Found if not given.
     resume, overwrite : bool
         Resume the run in the output file; replace it.
+    map_only : bool
+        Do not sample: draw from the Laplace approximation.
     say : callable, optional
         Told what the search found; without it no progress is shown.
 
@@ -262,14 +266,26 @@ def fit_frame(
                 f"{path}: got a link or a folder, expected a file or nothing there: remove it, or "
                 "write elsewhere"
             )
-    resume = paths.may_write(output, overwrite=overwrite, resume=resume, beside=others)
+    if map_only and resume:
+        raise InputError(
+            f"{output}: got both --map-only and --resume, expected one: there are no steps to "
+            "resume where nothing is sampled"
+        )
+    can_resume = None if map_only else resume
+    resume = paths.may_write(output, overwrite=overwrite, resume=can_resume, beside=others)
     try:
         with naming(job.run_file):
-            chain = sample(
-                posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles,
-                walkers=s.walkers, target_ess=s.target_ess, steps=s.steps, resume=resume,
-                overwrite=overwrite, progress=say is not None,
-            )  # fmt: skip
+            if map_only:
+                chain = laplace(
+                    posterior, estimate, path=output, seed=s.seed, overwrite=overwrite,
+                    progress=say is not None,
+                )  # fmt: skip
+            else:
+                chain = sample(
+                    posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles,
+                    walkers=s.walkers, target_ess=s.target_ess, steps=s.steps, resume=resume,
+                    overwrite=overwrite, progress=say is not None,
+                )  # fmt: skip
     except OSError as error:
         raise InputError(
             f"{output}: cannot be written ({error.strerror or error}), expected room and a folder "

@@ -145,7 +145,10 @@ def _row(values: dict[str, Any], parameter: Parameter) -> dict[str, str]:
         "unit": html_unit(parameter, scale.exponent),
         "z": _z(values["z"]) if "z" in values else "",
     }
-    return cells | {key: f"{values[key]:.{digits}f}" for key, digits in DIGITS.items()}
+    return cells | {
+        key: f"{values[key]:.{digits}f}" if math.isfinite(values[key]) else ""
+        for key, digits in DIGITS.items()
+    }
 
 
 def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
@@ -203,7 +206,7 @@ def page_figures(
     """
     posterior = chain.posterior()
     u, v, half_width = _star_positions(chain, posterior)
-    return [
+    figures = [
         PageFigure(
             "Frame, model and residual",
             "At the MAP. Grey pixels do not enter the likelihood.",
@@ -222,13 +225,17 @@ def page_figures(
                 chain.draws(), posterior.parameters, truth=truth, estimate=chain.estimate.params
             ),
         ),
-        PageFigure(
-            "Chain",
-            "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
-            "at 1 when all ensembles sample one distribution.",
-            trace_plot(chain, posterior.parameters),
-        ),
     ]
+    if chain.method == "mcmc":
+        figures.append(
+            PageFigure(
+                "Chain",
+                "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, "
+                "flat at 1 when all ensembles sample one distribution.",
+                trace_plot(chain, posterior.parameters),
+            )
+        )
+    return figures
 
 
 def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats, int]:
@@ -246,15 +253,20 @@ def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats,
 
 def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     n_ensembles, n_steps, n_walkers, d = chain.chain.shape
+    drawn = f"{diagnostics.n_draws} of {d} parameters, "
+    if chain.method == "mcmc":
+        how = [
+            ("sampler", f"{n_ensembles} ensembles of {n_walkers} walkers"),
+            ("steps", f"{n_steps}, {chain.burn_in} of them burn-in"),
+            ("draws", f"{drawn}acceptance {diagnostics.acceptance:.1%}"),
+        ]
+    else:
+        efficiency = f"importance efficiency {diagnostics.importance_efficiency:.0%}"
+        how = [("draws", f"{drawn}independent, of the Laplace approximation, {efficiency}")]
     return [
         ("chain file", printable(str(chain.path))),
         ("seed", str(chain.seed)),
-        ("sampler", f"{n_ensembles} ensembles of {n_walkers} walkers"),
-        ("steps", f"{n_steps}, {chain.burn_in} of them burn-in"),
-        (
-            "draws",
-            f"{diagnostics.n_draws} of {d} parameters, acceptance {diagnostics.acceptance:.1%}",
-        ),
+        *how,
         ("MAP", f"{chain.estimate.message} ({chain.estimate.n_evaluations} evaluations)"),
         ("pixels used", str(diagnostics.n_pixels)),
         (

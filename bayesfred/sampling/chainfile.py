@@ -10,7 +10,7 @@ read, and `io.serialize` stores the objects in it.
 import hashlib
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import h5py
 import numpy as np
@@ -23,7 +23,7 @@ from bayesfred.io.serialize import read, write, write_array
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chain import Chain, Method
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
@@ -102,6 +102,7 @@ def write_chain(chain: Chain) -> None:
         )
         file.attrs["parameter_names"] = np.array(chain.parameter_names, dtype=np.bytes_)
         file.attrs.update(target_ess=chain.target_ess, n_invalid=chain.n_invalid)
+        file.attrs["method"] = np.bytes_(chain.method)
         versions = file.create_group("versions")
         versions.attrs.update(
             {name: np.bytes_(version) for name, version in chain.versions.items()}
@@ -149,6 +150,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
         versions={name: version.decode() for name, version in file["versions"].attrs.items()},
         target_ess=float(file.attrs["target_ess"]),
         n_invalid=int(file.attrs["n_invalid"]),
+        method=_method(file.attrs.get("method", b"mcmc")),  # files had none before others came
     )
     names = tuple(name.decode() for name in file.attrs["parameter_names"])
     if names != chain.parameter_names:
@@ -172,6 +174,13 @@ def _read(path: Path, file: h5py.File) -> Chain:
     if not all(text.isprintable() for text in (chain.estimate.message, *chain.versions.values())):
         raise ValueError("texts that cannot be shown")
     return chain
+
+
+def _method(stored: bytes) -> Method:
+    for method in get_args(Method):
+        if stored == method.encode():
+            return cast("Method", method)
+    raise ValueError("no method of sampling")
 
 
 def _random_state(attributes: Any) -> tuple[Any, ...]:

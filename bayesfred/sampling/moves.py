@@ -61,6 +61,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         Shares of the approximations; they sum to 1.
     support : tuple of ndarray, shape (d,), optional
         Least and largest values that the prior admits.
+    heavy_share : float
+        w; 0 leaves the normal distributions alone.
 
     Raises
     ------
@@ -87,6 +89,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         covariance: Floats,
         weights: npt.ArrayLike = (1.0,),
         support: tuple[npt.ArrayLike, npt.ArrayLike] = (-np.inf, np.inf),
+        *,
+        heavy_share: float = HEAVY_SHARE,
     ) -> None:
         # the proposal does not come from the ensemble, whatever its size: all walkers move at once
         super().__init__(nsplits=1, randomize_split=False, live_dangerously=True)
@@ -109,9 +113,12 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         self.bounds = np.stack([low, high], axis=1)[near]
         self.means = means[:, self.order]
         self.weights = np.asarray(weights, dtype=np.float64)
+        self.heavy_share = heavy_share
 
     @classmethod
-    def of(cls, posterior: TargetDensity, estimate: MapEstimate) -> "LaplaceMove":
+    def of(
+        cls, posterior: TargetDensity, estimate: MapEstimate, *, heavy_share: float = HEAVY_SHARE
+    ) -> "LaplaceMove":
         """The move for a posterior, given its maximum.
 
         A hyperparameter tau, such as the scatter of the sources' positions, sets the errors of
@@ -137,7 +144,9 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
             low, high = posterior.support
             if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
                 mean = mean + estimate.covariance @ posterior.gradient(mean)
-            return cls(mean, estimate.covariance, support=posterior.support)
+            return cls(
+                mean, estimate.covariance, support=posterior.support, heavy_share=heavy_share
+            )
         if len(posterior.hyperparameters) > 1:
             raise InputError(
                 f"posterior: got the hyperparameters {', '.join(posterior.hyperparameters)}, "
@@ -168,6 +177,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
             np.array(covariances),
             np.exp(np.array(logs) - logsumexp(logs)),
             posterior.support,
+            heavy_share=heavy_share,
         )
 
     def draw(self, n: int, random: np.random.RandomState) -> Floats:
@@ -175,7 +185,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         k = random.choice(len(self.weights), n, p=self.weights)
         z = random.standard_normal((n, self.means.shape[1]))
         stretch = np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, n))
-        heavy = random.random_sample(n) < HEAVY_SHARE
+        heavy = random.random_sample(n) < self.heavy_share
         for i in range(len(self.bounds)):
             a, b = self._interval(i, self.means[k], self.lowers[k], z)
             z[:, i] = np.where(heavy, z[:, i], truncnorm.ppf(ndtr(z[:, i]), a, b))
@@ -200,15 +210,15 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         for mean, lower, weight in zip(self.means, self.lowers, self.weights, strict=True):
             z = solve_triangular(lower, (x[:, self.order] - mean).T, lower=True).T
             squared = (z**2).sum(axis=1)
-            normal = np.log1p(-HEAVY_SHARE) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
+            normal = np.log1p(-self.heavy_share) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
             for i in range(len(self.bounds)):
                 normal += truncnorm.logpdf(
                     z[:, i], *self._interval(i, mean, lower, z)
                 ) - norm.logpdf(z[:, i])
-            student = np.log(HEAVY_SHARE) + peak - 0.5 * (nu + d) * np.log1p(squared / nu)
-            parts.append(
-                np.logaddexp(normal, student) + np.log(weight) - np.log(np.diag(lower)).sum()
-            )
+            if self.heavy_share:
+                student = peak - 0.5 * (nu + d) * np.log1p(squared / nu)
+                normal = np.logaddexp(normal, np.log(self.heavy_share) + student)
+            parts.append(normal + np.log(weight) - np.log(np.diag(lower)).sum())
         return np.asarray(np.logaddexp.reduce(parts, axis=0))
 
     def get_proposal(

@@ -35,7 +35,7 @@ from bayesfred.sampling.checkpoints import Checkpoints, in_memory
 from bayesfred.sampling.ensembles import Step, adapted, advance, begin, check_start
 from bayesfred.sampling.stopping import burn_in, checks, sufficient
 
-__all__ = ["Run", "sample", "searching", "versions"]
+__all__ = ["Run", "check_estimate", "check_output", "sample", "searching", "versions"]
 
 MOST_STEPS = 100_000
 PACKAGES = ("bayesfred", "emcee", "numba", "numpy", "scipy")
@@ -132,17 +132,15 @@ def sample(
                 )
             return fresh().until(target_ess, steps, in_memory(), show=progress)
         path = Path(path)
-        if not path.parent.is_dir():
-            raise InputError(
-                f"{path}: no folder {path.parent}, expected one to write the chain to: create it"
-            )
-        try:
-            parts = fingerprint(posterior)
-        except InputError as error:  # no file can hold it
-            raise InputError(f"{path}: {error}, or sample it in memory, without a path") from None
+        parts = check_output(path, posterior)
         with only_writer(path):
             if may_write(path, resume=resume, overwrite=overwrite):
                 chain = open_chain(path)
+                if chain.method != "mcmc":
+                    raise InputError(
+                        f"{path}: got draws of the Laplace approximation, expected a sampled run "
+                        "to resume: start over with overwrite, or write to another file"
+                    )
                 _check_same(path, fingerprint(chain.posterior()), parts)
                 run = Run.resumed(posterior, chain)
             else:
@@ -150,6 +148,28 @@ def sample(
             checkpoints = Checkpoints(lambda chain: write_chain(replace(chain, path=path)))
             chain = run.until(target_ess, steps, checkpoints, show=progress)
             return replace(chain, path=path)
+
+
+def check_output(path: Path, posterior: TargetDensity) -> dict[str, str]:
+    """The posterior's fingerprint, where a chain file can be written that holds it."""
+    if not path.parent.is_dir():
+        raise InputError(
+            f"{path}: no folder {path.parent}, expected one to write the chain to: create it"
+        )
+    try:
+        return fingerprint(posterior)
+    except InputError as error:  # no file can hold it
+        raise InputError(f"{path}: {error}, or sample it in memory, without a path") from None
+
+
+def check_estimate(posterior: TargetDensity, estimate: MapEstimate) -> None:
+    """Refuse the maximum of a posterior with other parameters."""
+    expected = len(posterior.parameter_names)
+    if np.shape(estimate.params) != (expected,):
+        raise InputError(
+            f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
+            "this posterior's maximum"
+        )
 
 
 def searching() -> Status:
@@ -214,12 +234,7 @@ class Run:
         walkers: int = 32,
         steps: Sequence[Step] = (),
     ) -> None:
-        expected = len(posterior.parameter_names)
-        if np.shape(estimate.params) != (expected,):
-            raise InputError(
-                f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
-                "this posterior's maximum"
-            )
+        check_estimate(posterior, estimate)
         self.posterior, self.estimate, self.seed = posterior, estimate, seed
         self.near = posterior.near(estimate.params, estimate.covariance)
         self.steps = list(steps)

@@ -35,7 +35,8 @@ def summary(
         Values that a simulation used.
     columns : mapping of str to mapping of str to float, optional
         Further columns, values by parameter name, such as `Diagnostics.columns`; with `rhat` among
-        them nothing is computed twice. By default `rhat`, `ess_bulk` and `ess_tail`.
+        them nothing is computed twice. By default `rhat`, `ess_bulk` and `ess_tail` of a sampled
+        chain, none of a Laplace approximation.
 
     Returns
     -------
@@ -52,7 +53,8 @@ def summary(
     >>> draws = np.random.default_rng(1).normal(5.0, 0.1, (4, 50, 32, 1))
     >>> chain = SimpleNamespace(
     ...     chain=draws, burn_in=0, draws=lambda: draws.reshape(-1, 1), posterior=lambda: None,
-    ...     parameter_names=("level",), estimate=SimpleNamespace(params=np.array([5.0])))
+    ...     method="mcmc", parameter_names=("level",),
+    ...     estimate=SimpleNamespace(params=np.array([5.0])))
     >>> table = summary(chain)
     >>> table.colnames
     ['name', 'unit', 'MAP', 'mean', 'sd', 'rhat', 'ess_bulk', 'ess_tail']
@@ -67,7 +69,9 @@ def summary(
     given = {} if truth is None else {"truth": np.asarray(truth, dtype=np.float64)}
     with np.errstate(divide="ignore", invalid="ignore"):
         z = {key: (mean - value) / sd for key, value in given.items()}
-    if columns is None:
+    if columns is None and chain.method == "laplace":
+        more = {}  # independent draws: nothing to converge
+    elif columns is None:
         found = convergence(chain.chain[:, chain.burn_in :])
         more = dict(zip(("rhat", "ess_bulk", "ess_tail"), found, strict=True))
     else:
