@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.checks import Check, check_table
 from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_checks
-from bayesfred.io.summary_table import Table
+from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
 from bayesfred.sampling.chain import Chain
@@ -105,8 +105,9 @@ class Diagnostics:
         A coefficient of the distortion is among them only if the prior decides a displacement that
         it takes part in: the sensitivity of the displacement along the coefficient's pattern over
         the frame is at least 0.05 too.
-    residuals : Residuals
-        The table of sources, and what the residuals show.
+    residuals : Residuals or None
+        The table of sources, and what the residuals show; None for a density that is not a
+        `Posterior` of a frame.
     checks : astropy.table.Table
         A row for each check of the fit, with the columns name, value, expected, sd, z and meaning:
         the two sums above, the randomised PIT, the whiteness of the residuals, displacement against
@@ -137,13 +138,13 @@ class Diagnostics:
     prior_sensitivity: dict[str, float]
     likelihood_sensitivity: dict[str, float]
     prior_dominated: tuple[str, ...]
-    residuals: Residuals = field(repr=False, compare=False)
+    residuals: Residuals | None = field(repr=False, compare=False)
     checks: Table = field(repr=False, compare=False)
 
     @property
     def sources(self) -> Table:
         """How well every source agrees with the counts, see `analysis.sources.source_table`."""
-        return self.residuals.sources
+        return make_table({}) if self.residuals is None else self.residuals.sources
 
     @property
     def trustworthy(self) -> bool:
@@ -229,8 +230,10 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     fits_data = abs(misfit(fit)) <= CONSISTENT
     trusted = "not " if failures or not fits_data else ""
     message = f"{trusted}trustworthy: {_fit_sentence(fit)} {sampling}"
-    residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
-    checks = [*_sums(fit), *residuals.checks]
+    residuals, checks = None, _sums(fit)
+    if isinstance(posterior, Posterior):
+        residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
+        checks += residuals.checks
     if predictive:
         draws = _draws(chain)
         some = np.linspace(0, len(draws) - 1, min(predictive, len(draws))).astype(int)

@@ -99,13 +99,7 @@ def page_figures(
             _described_stars(fitted, u, v),
             star_panels(fitted, u, v, half_width=half_width),
         ),
-        PageFigure(
-            "Residuals",
-            "Their distribution beside that of a true model, the displacement of the sources "
-            "against the position of their images within a pixel, and every source's chi-square.",
-            described_residuals(diagnostics.residuals),
-            residual_panels(diagnostics.residuals, posterior.model.detector.shape),
-        ),
+        *_residual_figures(diagnostics, posterior),
         *_posterior_figures(chain, shown, truth),
     ]
     if chain.method == "mcmc":
@@ -119,6 +113,21 @@ def page_figures(
             )
         )
     return figures
+
+
+def _residual_figures(diagnostics: Diagnostics, posterior: Posterior) -> list[PageFigure]:
+    """What the residuals show, of a posterior of a frame."""
+    if diagnostics.residuals is None:
+        return []
+    return [
+        PageFigure(
+            "Residuals",
+            "Their distribution beside that of a true model, the displacement of the sources "
+            "against the position of their images within a pixel, and every source's chi-square.",
+            described_residuals(diagnostics.residuals),
+            residual_panels(diagnostics.residuals, posterior.model.detector.shape),
+        )
+    ]
 
 
 def _posterior_figures(

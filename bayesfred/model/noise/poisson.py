@@ -140,7 +140,9 @@ class PoissonNoise(Noise):
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         n, mu = counts + self.shift, mean + self.shift
-        return np.asarray(2.0 * (xlogy(n, np.maximum(n, 0.0) / mu) - n + mu))
+        # read noise may take counts below zero, where the best mean is zero
+        positive = np.maximum(n, 0.0)
+        return np.asarray(2.0 * (xlogy(positive, positive / mu) - n + mu))
 
     def deviance_moments(
         self, mean: Floats, background: float | Floats
