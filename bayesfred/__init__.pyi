@@ -3,7 +3,9 @@ from .analysis.choose_terms import TermChoice, choose_terms
 from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
+from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.sbc import PosteriorCalibration, calibrate_posterior
 from .errors import InputError
 from .imaging.catalog import SourceCatalog
@@ -21,6 +23,7 @@ from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
 from .sampling.laplace import laplace
 from .sampling.moves import LaplaceMove
+from .sampling.record import RunRecord
 from .sampling.sampler import sample
 
 __all__ = [
@@ -30,6 +33,7 @@ __all__ = [
     "CrossCheck",
     "Detector",
     "Diagnostics",
+    "DisplacementField",
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",
@@ -40,10 +44,12 @@ __all__ = [
     "MoffatPSF",
     "NoiseStudy",
     "Nuisances",
+    "PhotonsNeeded",
     "PoissonNoise",
     "PolynomialDistortion",
     "Posterior",
     "PosteriorCalibration",
+    "RunRecord",
     "SampledPSF",
     "SourceCatalog",
     "TermChoice",
@@ -54,10 +60,12 @@ __all__ = [
     "correct_sampling",
     "cross_check",
     "diagnose",
+    "displacement_field",
     "find_map",
     "laplace",
     "noise_study",
     "open_chain",
+    "photons_needed",
     "reject_outliers",
     "sample",
     "sampling_matrix",

@@ -32,6 +32,14 @@ ChainFile = Annotated[
     Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="PAGE.html", help="The page.", show_default="beside the chain"),
+]
+MapOnly = Annotated[
+    bool,
+    typer.Option("--map-only", help="Do not sample: maximum, and errors from the information."),
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the output file.")]
 
 
@@ -49,12 +57,13 @@ def demo(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the simulated frame and of the sampler.")
     ] = 1,
+    map_only: MapOnly = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 terms, Poisson counts."""
     _run(
         lambda: bf.show.show_run(
-            bf.commands.demo(folder, seed=seed, overwrite=overwrite, say=print)
+            bf.commands.demo(folder, seed=seed, map_only=map_only, overwrite=overwrite, say=print)
         )
     )
 
@@ -66,11 +75,15 @@ def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
 
 
 @app.command(epilog="A complete run file:\n\n" + _example())
-def fit(run_file: Run, resume: Resume = False, overwrite: Overwrite = False) -> None:
+def fit(
+    run_file: Run, map_only: MapOnly = False, resume: Resume = False, overwrite: Overwrite = False
+) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
     _run(
         lambda: bf.show.show_run(
-            bf.commands.fit(run_file, resume=resume, overwrite=overwrite, say=print)
+            bf.commands.fit(
+                run_file, map_only=map_only, resume=resume, overwrite=overwrite, say=print
+            )
         )
     )
 
@@ -126,9 +139,26 @@ def report(
             min=1, help="Effective draws to ask of every parameter.", show_default="the run's"
         ),
     ] = None,
+    corner: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,NAME,...",
+            help="Parameters to show in pairs.",
+            show_default="at most 12, of the most correlated pairs",
+        ),
+    ] = "",
+    out: Out = None,
+    overwrite: Overwrite = False,
 ) -> None:
-    """Judge a chain file again and write its report, .html and .png, beside it."""
-    _run(lambda: bf.show.show_run(bf.commands.report(chain_file, target_ess=target_ess)))
+    """Judge a chain file again and write its report, .html and .png."""
+    names = [name.strip() for name in corner.split(",") if name.strip()]
+    _run(
+        lambda: bf.show.show_run(
+            bf.commands.report(
+                chain_file, target_ess=target_ess, corner=names, out=out, overwrite=overwrite
+            )
+        )
+    )
 
 
 @app.command()

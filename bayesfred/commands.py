@@ -7,6 +7,7 @@ Every command returns a record and prints nothing. What should be known while it
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
+from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
-from bayesfred.io import atomic, paths
+from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.io.tables import TableRecord, write_table
@@ -28,6 +30,8 @@ from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
+_SEEDED = ("sampling", "simulation")
+DEMO_ERROR = 0.001  # pixel
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
     "PSF of 10 pixels. The coefficients are those of its Table 2, read with g in y and the columns "
@@ -37,7 +41,12 @@ DEMO_NOTE = (
 
 
 def demo(
-    folder: PathLike, *, seed: int = 1, overwrite: bool = False, say: Say | None = None
+    folder: PathLike,
+    *,
+    seed: int = 1,
+    map_only: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result:
     """Simulate the frame of the example run file, which is the paper's, and fit it.
 
@@ -47,6 +56,8 @@ def demo(
         Where demo.h5 goes; created if it does not exist.
     seed : int
         Seed of the frame and of the sampler.
+    map_only : bool
+        Do not sample, see `fit`.
     overwrite : bool
         Replace an earlier demo.
     say : callable, optional
@@ -62,13 +73,16 @@ def demo(
         If the folder cannot be created, or holds a demo already.
     """
     output = Path(folder, "demo.h5")
-    pipeline.make_folder(output)
+    outputs.make_folder(output)
     example = Path(__file__).with_name("example.toml")
     run = settings.read_settings(example)
-    run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
+    seeded = {key: getattr(run, key).model_copy(update={"seed": seed}) for key in _SEEDED}
+    run = run.model_copy(update={**seeded, "study": None})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
-    return pipeline.fit_frame(job, posterior, overwrite=overwrite, say=say)
+    result = pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
+    needed = photons_needed(posterior, result.chain.estimate.params, DEMO_ERROR)
+    return replace(result, photons=needed)
 
 
 def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
@@ -114,7 +128,12 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
 
 
 def fit(
-    run_file: PathLike, *, resume: bool = False, overwrite: bool = False, say: Say | None = None
+    run_file: PathLike,
+    *,
+    map_only: bool = False,
+    resume: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result:
     """Fit the frame of a run file: MAP, draws, diagnostics, report.
 
@@ -122,6 +141,8 @@ def fit(
     ----------
     run_file : path-like
         TOML, see `bayesfred fit --help`.
+    map_only : bool
+        Do not sample: draw from the Laplace approximation at the maximum, see `bf.laplace`.
     resume : bool
         Resume the run in the output file.
     overwrite : bool
@@ -151,9 +172,11 @@ def fit(
         )
     posterior, estimate, notes = pipeline.read_frame(run, run_file, say)
     if run.output.path is None:
-        pipeline.make_folder(output)
+        outputs.make_folder(output)
     job = pipeline.Job(run, run_file, output, notes)
-    return pipeline.fit_frame(job, posterior, estimate, resume=resume, overwrite=overwrite, say=say)
+    return pipeline.fit_frame(
+        job, posterior, estimate, map_only=map_only, resume=resume, overwrite=overwrite, say=say
+    )
 
 
 def study(
@@ -212,7 +235,7 @@ def study(
     else:
         posterior, truth = build.simulated(run, run_file, simulation.seed)
     if s.path is None:
-        pipeline.make_folder(table)
+        outputs.make_folder(table)
     with ExitStack() as stack:
         stack.enter_context(pipeline.naming(run_file))
         executor = stack.enter_context(cluster(scheduler)) if scheduler else None
@@ -227,7 +250,7 @@ def study(
                 model, truth[: model.distortion.n_terms], s.background or simulation.background,
                 flux=s.flux or (), sources=s.sources or (), psf_sigma=s.psf_sigma or (),
                 exposure=s.exposure or (), method=s.method or "laplace", noise=posterior.noise,
-                nuisances=posterior.nuisances, prior=build.priors_given(run), **how,
+                nuisances=posterior.nuisances, prior=build.priors_given(run), error=s.error, **how,
             )  # fmt: skip
         else:
             result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)
@@ -241,14 +264,29 @@ def study(
     return Study(result, table, findings, picture)
 
 
-def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
-    """Judge a chain file again, and write its page and picture beside it.
+def report(
+    chain_file: PathLike,
+    *,
+    target_ess: float | None = None,
+    corner: Sequence[str] = (),
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> Result:
+    """Judge a chain file again, and write its page and picture.
 
     Parameters
     ----------
     chain_file : path-like
     target_ess : float, optional
         Effective draws to ask of every parameter; by default the number that the run was made for.
+    corner : sequence of str, optional
+        Parameters to show in pairs; by default all, or of more than twelve those of the most
+        correlated pairs.
+    out : path-like, optional
+        The page, .html; by default beside the chain. The picture, .png, and the table of sources,
+        .sources.ecsv, go beside the page.
+    overwrite : bool
+        Replace page, picture and table.
 
     Returns
     -------
@@ -257,16 +295,17 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
     Raises
     ------
     InputError
-        If the chain is missing, damaged, or named as its page or picture would be.
+        If the chain is missing, damaged, or named as its page or picture would be; if a page,
+        picture or table exists, or `corner` names what is no parameter.
     """
     path = Path(chain_file)
     chain = open_chain(path)
-    if path in pipeline.beside(path):
-        raise InputError(
-            f"{path}: got a chain named as its report, which would replace it, expected "
-            "NAME.h5: rename it"
-        )
-    return pipeline.write_results(chain, path, target_ess=target_ess or chain.target_ess)
+    page, *others = outputs.beside(path if out is None else Path(out))
+    if out is not None:
+        page = Path(out)
+    outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
+    target = target_ess or chain.target_ess
+    return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
 
 
 def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:

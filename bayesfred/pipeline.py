@@ -15,22 +15,29 @@ from bayesfred import build, settings
 from bayesfred._typing import Floats
 from bayesfred.analysis.choose_terms import choose_terms
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
+from bayesfred.analysis.field import DisplacementField, displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
+from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
-from bayesfred.io import atomic, frames, paths
+from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import reject_outliers
+from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
-from bayesfred.reporting.html import page_figures, write_report
-from bayesfred.reporting.posteriors import overview
+from bayesfred.reporting.html import write_report
+from bayesfred.reporting.posteriors import corner_parameters, overview
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import open_chain
+from bayesfred.sampling.laplace import laplace
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import sample, searching
 from bayesfred.sampling.summary import summary
+from bayesfred.sections import toml
 
 __all__ = [
     "Job",
@@ -39,15 +46,20 @@ __all__ = [
     "Simulated",
     "Study",
     "Verification",
-    "beside",
     "fit_frame",
-    "make_folder",
     "naming",
     "read_frame",
     "write_results",
 ]
 
 Say = Callable[[str], None]
+
+SOURCES_META = {
+    "x, y": "catalogue position, fine pixel from the middle of the frame",
+    "u, v, du, dv, phase": "recorded pixel, u and v from the middle of the frame",
+    "flux, peak": "counts",
+    "columns": "see bayesfred.analysis.sources.source_table",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,18 +70,25 @@ class Result:
     ----------
     chain : Chain
     diagnostics : Diagnostics
+    field : DisplacementField
+        How far the frame displaces its objects, and how well that is known.
     summary : astropy.table.Table
         The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
-    path, page, picture : Path
-        The files: the chain, its report and its picture.
+    path, page, picture, sources : Path
+        The files: the chain, its report, its picture and its table of sources.
+    photons : PhotonsNeeded, optional
+        What a smaller error would take, where that was asked.
     """
 
     chain: Chain
     diagnostics: Diagnostics
+    field: DisplacementField
     summary: Table
     path: Path
     page: Path
     picture: Path
+    sources: Path
+    photons: PhotonsNeeded | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +257,10 @@ def fit_frame(
     *,
     resume: bool = False,
     overwrite: bool,
+    map_only: bool = False,
     say: Say | None,
 ) -> Result:
-    """Find the maximum, sample, and write the results.
+    """Find the maximum, sample or draw from the Laplace approximation, and write the results.
 
     Parameters
     ----------
@@ -250,6 +270,8 @@ def fit_frame(
         Found if not given.
     resume, overwrite : bool
         Resume the run in the output file; replace it.
+    map_only : bool
+        Do not sample: draw from the Laplace approximation.
     say : callable, optional
         Told what the search found; without it no progress is shown.
 
@@ -267,7 +289,7 @@ def fit_frame(
         raise InputError(
             f"{output}: no folder {output.parent}, expected one to write the chain to: create it"
         )
-    others = beside(output)
+    others = outputs.beside(output)
     hidden = (output.with_name(f".{output.name}.{kind}") for kind in ("lock", "tmp", "writer"))
     for path in (output, *others, *hidden):
         if os.path.islink(path) or os.path.isdir(path):
@@ -275,14 +297,27 @@ def fit_frame(
                 f"{path}: got a link or a folder, expected a file or nothing there: remove it, or "
                 "write elsewhere"
             )
-    resume = paths.may_write(output, overwrite=overwrite, resume=resume, beside=others)
+    if map_only and resume:
+        raise InputError(
+            f"{output}: got both --map-only and --resume, expected one: there are no steps to "
+            "resume where nothing is sampled"
+        )
+    can_resume = None if map_only else resume
+    resume = paths.may_write(output, overwrite=overwrite, resume=can_resume, beside=others)
     try:
         with naming(job.run_file):
-            chain = sample(
-                posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles,
-                walkers=s.walkers, target_ess=s.target_ess, steps=s.steps, resume=resume,
-                overwrite=overwrite, progress=say is not None,
-            )  # fmt: skip
+            record = _record(job, open_chain(output) if resume else None)
+            if map_only:
+                chain = laplace(
+                    posterior, estimate, path=output, seed=s.seed, overwrite=overwrite,
+                    progress=say is not None, record=record,
+                )  # fmt: skip
+            else:
+                chain = sample(
+                    posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles,
+                    walkers=s.walkers, target_ess=s.target_ess, steps=s.steps, resume=resume,
+                    overwrite=overwrite, progress=say is not None, record=record,
+                )  # fmt: skip
     except OSError as error:
         raise InputError(
             f"{output}: cannot be written ({error.strerror or error}), expected room and a folder "
@@ -290,21 +325,41 @@ def fit_frame(
         ) from error
     if say:
         say(f"maximum: {chain.estimate.message}")
-    return write_results(chain, output, job, target_ess=s.target_ess)
+    return write_results(chain, output, output, target_ess=s.target_ess)
 
 
-def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_ess: float) -> Result:
-    """Judge a chain, and write page and picture beside it.
+def _record(job: Job, before: Chain | None) -> RunRecord:
+    """What the chain keeps of a run; a resumed one has the seed and ensembles of its beginning."""
+    run = job.run
+    if before is not None:
+        ensembles, _, walkers, _ = before.chain.shape
+        used = {"seed": before.seed, "ensembles": ensembles, "walkers": walkers}
+        run = run.model_copy(update={"sampling": run.sampling.model_copy(update=used)})
+    return RunRecord(
+        printable(job.run_file.stem),
+        printable(Path(run.frame.path).name) if job.truth is None else "simulated frame",
+        toml(run),
+        tuple(job.notes),
+        job.truth,
+    )
+
+
+def write_results(
+    chain: Chain, path: Path, page: Path, *, target_ess: float, corner: Sequence[str] = ()
+) -> Result:
+    """Judge a chain, and write its page, picture and table of sources.
 
     Parameters
     ----------
     chain : Chain
     path : Path
         The chain's file.
-    job : Job, optional
-        The run that made the chain, if it is known.
+    page : Path
+        A file with the page's name but for the suffix.
     target_ess : float
         Effective draws to ask of every parameter.
+    corner : sequence of str, optional
+        Parameters to show in pairs; by default chosen.
 
     Returns
     -------
@@ -313,61 +368,29 @@ def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_es
     Raises
     ------
     InputError
-        If page or picture cannot be written.
+        If a file cannot be written, or `corner` names what is no parameter.
     """
-    posterior, truth = chain.posterior(), job.truth if job else None
+    posterior = chain.posterior()
+    truth = chain.record.truth if chain.record else None
+    shown = corner_parameters(chain.draws(), chain.parameter_names, corner)
     diagnostics = diagnose(chain, target_ess=target_ess)
+    field = displacement_field(chain)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
-    page, picture = beside(path)
+    page, picture, sources = outputs.beside(page)
     write_report(
         page,
-        title=printable((job.run_file if job else path).stem),
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
-        figures=page_figures(fitted, chain, truth=truth),
-        notes=job.notes if job else (),
-        settings=job.run.model_dump_json(indent=2) if job else None,
+        figures=page_figures(fitted, chain, diagnostics, field, shown=shown, truth=truth),
+        result=field.message,
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
-    return Result(chain, diagnostics, table, path, page, picture)
-
-
-def beside(chain: Path) -> tuple[Path, Path]:
-    """Name the page and the picture of a chain file.
-
-    Parameters
-    ----------
-    chain : Path
-
-    Returns
-    -------
-    page, picture : Path
-
-    Examples
-    --------
-    >>> [path.name for path in beside(Path("run.h5"))]
-    ['run.html', 'run.png']
-    """
-    return chain.with_suffix(".html"), chain.with_suffix(".png")
-
-
-def make_folder(path: Path) -> None:
-    """Create the folder of an output file, unless it exists.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be created.
-    """
-    with atomic.writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    found = diagnostics.sources
+    columns = {name: found[name].data for name in found.colnames}
+    tables.write_table(sources, tables.TableRecord(columns, SOURCES_META), overwrite=True)
+    return Result(chain, diagnostics, field, table, path, page, picture, sources)
 
 
 @contextmanager

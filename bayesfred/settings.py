@@ -3,7 +3,7 @@
 Each section is a frozen model with the keys, units and defaults of the run file;
 :func:`read_settings` checks all of them at once and says every mistake in one line. The sections
 `[detector]`, `[psf]`, `[noise]` and `[nuisances]` have the fields of the class that they describe,
-see `sections`; `kind` names the class. `build` makes the objects. `model_dump_json` gives the text
+see `sections`; `kind` names the class. `build` makes the objects. `sections.toml` gives the text
 that result files keep. `example.toml` beside this module is a complete run file.
 """
 
@@ -224,13 +224,11 @@ class StudySettings(Section):
     Attributes
     ----------
     kind : {'noise', 'sbc'}
-        Fits of the truth of [simulation] at several noise levels, or simulation-based calibration:
-        truths from the priors.
+        Fits of the truth of [simulation] at several noise levels, or of truths from the priors.
     replicates : int
         Frames of every noise level, or of the calibration.
     method : {'laplace', 'mcmc'}, optional
-        The maximum with its Fisher information, or draws; by default the first for 'noise', the
-        second for 'sbc'.
+        Maximum and Fisher information, the default of 'noise', or draws, the default of 'sbc'.
     seed : int
         Seed of every random number.
     background : tuple of float, optional, counts per pixel
@@ -243,6 +241,8 @@ class StudySettings(Section):
         Widths of the PSF.
     exposure : tuple of float, optional
         Factors of flux and background together.
+    error : float, pixel
+        The rms error of the displacement for which a noise study counts photons.
     path : str, optional
         The table of results, .ecsv, inside the folder that the study is started in.
     """
@@ -256,6 +256,7 @@ class StudySettings(Section):
     sources: tuple[_Count, ...] | None = None
     psf_sigma: tuple[_Positive, ...] | None = None
     exposure: tuple[_Positive, ...] | None = None
+    error: _Positive = 0.01
     path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None
 
 
@@ -319,8 +320,7 @@ def read_settings(path: PathLike) -> RunSettings:
     try:
         # A byte order mark, which some editors write, is not TOML.
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        # JSON is what result files keep, so a run file is checked by the rules it will be read back
-        # with. Dates, which only TOML has, are no key's type.
+        # The rules are those of JSON. Dates, which only TOML has, are no key's type.
         return RunSettings.model_validate_json(
             json.dumps(table, default=lambda date: {str(date): "date"})
         )

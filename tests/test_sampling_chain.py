@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import arviz_stats
@@ -19,6 +20,7 @@ import pytest
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
+from scipy.signal import lfilter
 from test_model import EVERYTHING, make_model, make_posterior, make_truth
 from threadpoolctl import threadpool_limits
 
@@ -36,6 +38,7 @@ from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import fingerprint, open_chain, write_chain
 from bayesfred.sampling.checkpoints import Checkpoints, in_memory
 from bayesfred.sampling.convergence import convergence
+from bayesfred.sampling.datatree import source_of_pixels
 from bayesfred.sampling.ensembles import DE_SHARE, adapted, moves_after
 from bayesfred.sampling.sampler import Run, sample
 from bayesfred.sampling.stopping import checks, forgetting
@@ -271,31 +274,91 @@ def test_a_density_that_no_file_can_hold_is_refused_before_sampling(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_ensemble_is_a_chain_for_arviz(whole: Chain) -> None:
-    tree = whole.to_datatree()
-    shape = (2, 8 * (TOTAL - whole.burn_in))
-    assert tree["posterior"]["background"].shape == tree["sample_stats"]["lp"].shape == shape
-    second = whole.burn_in + 1  # of the steps that are kept: after the 8 walkers' first ones
+@pytest.mark.parametrize("burn_in", [3, 4])  # an even and an odd number of steps
+def test_an_ensemble_is_a_chain_for_arviz(whole: Chain, burn_in: int) -> None:
+    chain = replace(whole, burn_in=burn_in)
+    tree = chain.to_datatree()
+    steps = TOTAL - burn_in
+    assert (
+        tree["posterior"]["background"].shape == tree["sample_stats"]["lp"].shape == (2, 8 * steps)
+    )
+    early = (steps + 1) // 2  # of the first walker
     for name, k in (("f_ux", 0), ("background", 12)):
-        assert np.array_equal(tree["posterior"][name].values[1, 8:16], whole.chain[1, second, :, k])
-    assert np.array_equal(tree["sample_stats"]["lp"].values[1, 8:16], whole.log_prob[1, second])
-    rhat = convergence(whole.chain[:, whole.burn_in :])[0]
+        series, own = tree["posterior"][name].values[1], chain.chain[1, burn_in:, :, k]
+        assert np.array_equal(series[:early], own[:early, 0])
+        assert np.array_equal(series[-(steps - steps // 2) :], own[steps // 2 :, -1])
+        assert np.array_equal(np.sort(series), np.sort(own, axis=None))
+    lp = tree["sample_stats"]["lp"].values[1]
+    assert np.array_equal(lp[:early], chain.log_prob[1, burn_in : burn_in + early, 0])
+    rhat, bulk, tail = convergence(chain.chain[:, burn_in:])
     theirs = arviz_stats.rhat(tree)
-    for name, ours in zip(whole.parameter_names, rhat, strict=True):
-        assert float(theirs[name]) == pytest.approx(ours, rel=1e-6)
+    for k, name in enumerate(chain.parameter_names):
+        assert float(theirs[name]) == pytest.approx(rhat[k], rel=1e-6)
+        stored = tree["posterior"][name].attrs
+        assert [stored[key] for key in ("rhat", "ess_bulk", "ess_tail")] == [
+            rhat[k], bulk[k], tail[k],
+        ]  # fmt: skip
+    assert tree["posterior"]["f_ux"].attrs["units"] == "px^-1"
 
 
-def test_what_arviz_assumes_of_draws_is_what_the_documentation_says(whole: Chain) -> None:
-    """Steps of correlation 0.9: 1000 steps of 128 walkers have 1000 x 128 x 0.1 / 1.9 = 6737."""
+@pytest.mark.parametrize(("phi", "within"), [(0.0, 0.1), (0.5, 0.15), (0.9, 0.35)])
+def test_arviz_counts_the_correlation_of_steps(whole: Chain, phi: float, within: float) -> None:
+    """160 steps of 128 walkers that follow an AR(1) process: (1 - phi) / (1 + phi) of the draws.
+
+    An effective sample size is known to about 3 % for phi = 0.5 and to 9 % for 0.9. In the order
+    of the steps arviz finds 3 and 18 times too many: the negative control.
+    """
     rng = np.random.default_rng(1)
-    steps = np.empty((4, 1000, 32, 13))
-    steps[:, 0] = rng.standard_normal((4, 32, 13))
-    for n in range(1, 1000):
-        steps[:, n] = 0.9 * steps[:, n - 1] + 0.19**0.5 * rng.standard_normal((4, 32, 13))
-    long = replace(whole, chain=steps, log_prob=steps[..., 0], burn_in=0)
-    ess = float(arviz_stats.ess(long.to_datatree())["f_ux"])
-    assert convergence(steps[..., :1])[1][0] == pytest.approx(6737, rel=0.1)
-    assert 15 < ess / 6737 < 21
+    noise = rng.standard_normal((4, 400, 32, 1)) * (1 - phi**2) ** 0.5
+    steps = lfilter([1.0], [1.0, -phi], noise, axis=1)[:, -160:]
+    right = steps.size * (1 - phi) / (1 + phi)
+    chain = replace(
+        whole, density=SimpleNamespace(parameter_names=("f_ux",)), chain=steps,
+        log_prob=steps[..., 0], burn_in=0,
+    )  # fmt: skip
+    tree = chain.to_datatree()
+    ess = float(arviz_stats.ess(tree)["f_ux"])
+    assert ess == pytest.approx(right, rel=within)
+    assert tree["posterior"]["f_ux"].attrs["ess_bulk"] == pytest.approx(right, rel=within)
+    wrong = xr.Dataset({"f_ux": (("chain", "draw"), steps.reshape(4, -1))})
+    if phi:
+        assert float(arviz_stats.ess(wrong)["f_ux"]) > 2.5 * right
+
+
+def test_the_tree_holds_the_frame_and_the_likelihood_by_source(whole: Chain) -> None:
+    posterior = whole.posterior()
+    tree = whole.to_datatree(log_likelihood=True)
+    observed, known = tree["observed_data"], tree["constant_data"]
+    used = posterior.mask
+    assert np.array_equal(observed["mask"], used)
+    assert np.array_equal(observed["counts"].values[used], posterior.counts[used])
+    assert np.isnan(observed["counts"].values[~used]).all()
+    assert float(observed["u"][0]) == -0.5 * (used.shape[1] - 1)
+    assert np.array_equal(known["flux"], posterior.model.sources.flux)
+    assert float(known["psf_sigma"]) == posterior.model.psf.sigma
+    found = tree["log_likelihood"]["counts"]
+    assert found.dims == ("chain", "draw", "source")
+    draws = np.stack([tree["posterior"][name].values for name in whole.parameter_names], axis=-1)
+    draws = draws[:, found["draw"].values].reshape(-1, draws.shape[-1])
+    total = posterior.log_prob(draws) - posterior.log_prior(draws)
+    np.testing.assert_allclose(found.values.sum(axis=2).ravel(), total, rtol=1e-10)
+
+
+def test_a_pixel_belongs_to_the_source_that_lights_it(whole: Chain) -> None:
+    """Against images of every source alone."""
+    posterior, params = whole.posterior(), whole.estimate.params
+    model, owner = posterior.model, source_of_pixels(posterior, params)
+    s, theta = model.sources, params[: model.distortion.n_terms]
+    alone = np.stack([
+        replace(model, sources=SourceCatalog(s.x[k : k + 1], s.y[k : k + 1], s.flux[k : k + 1]))
+        .expected_counts(theta)[posterior.mask]
+        for k in range(len(s))
+    ])  # fmt: skip
+    lit = owner < len(s)
+    clear = np.sort(alone, axis=0)[-1] > 1.5 * np.sort(alone, axis=0)[-2]
+    assert lit.any() and (~lit).any()
+    assert np.array_equal(owner[lit & clear], alone.argmax(axis=0)[lit & clear])
+    assert alone.max(axis=0)[~lit].max() < alone.max() * 0.05
 
 
 def test_emcee_reads_the_file(whole: Chain) -> None:

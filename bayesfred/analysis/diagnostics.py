@@ -19,7 +19,7 @@ time.
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import arviz_base
 import lazy_loader
@@ -27,10 +27,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats, Ints
+from bayesfred.analysis.checks import Check, check_table
+from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_checks
+from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
+from bayesfred.sampling.laplace import importance_efficiency
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
 
@@ -39,6 +43,7 @@ arviz_stats = lazy_loader.load("arviz_stats")
 
 MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
+MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
 FEWEST = 100  # draws from which a sensitivity is read
 FLAT = 1e-6  # difference of log densities that moves no posterior
 FIELD_POINTS = 9  # along each axis of the frame
@@ -51,9 +56,10 @@ class Diagnostics:
 
     Attributes
     ----------
-    sampled_well : bool
+    sampled_well : bool or None
         Whether R-hat, effective sample sizes and acceptance are as they should be, and the MAP is
-        at the maximum. It says nothing of the model.
+        at the maximum. It says nothing of the model. None where nothing was sampled: the draws are
+        those of the Laplace approximation, and what is said of sampling below is nan.
     fits_data : bool
         Whether the deviance is what the noise makes it, within 5 standard deviations. It says
         nothing of the sampling.
@@ -64,6 +70,11 @@ class Diagnostics:
         Rank-normalised split R-hat between ensembles, by parameter.
     ess_bulk, ess_tail : dict of str to float
         Effective numbers of draws for the centre and for the 5 % and 95 % quantiles, by parameter.
+    importance_efficiency : float
+        How well draws of the Laplace approximation represent the posterior, from 0 to 1, see
+        `bayesfred.sampling.laplace`; nan of a sampled chain.
+    at_maximum : bool
+        Whether the MAP is at the maximum.
     tau : dict of str to float
         Integrated autocorrelation time, in steps, by parameter; a lower bound where the chain is
         shorter than 10 tau.
@@ -94,14 +105,22 @@ class Diagnostics:
         A coefficient of the distortion is among them only if the prior decides a displacement that
         it takes part in: the sensitivity of the displacement along the coefficient's pattern over
         the frame is at least 0.05 too.
+    residuals : Residuals
+        The table of sources, and what the residuals show.
+    checks : astropy.table.Table
+        A row for each check of the fit, with the columns name, value, expected, sd, z and meaning:
+        the two sums above, the randomised PIT, the whiteness of the residuals, displacement against
+        pixel phase, and the posterior predictive draws that were asked for.
     """
 
-    sampled_well: bool
+    sampled_well: bool | None
     fits_data: bool
     message: str
     rhat: dict[str, float]
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
+    importance_efficiency: float
+    at_maximum: bool
     tau: dict[str, float]
     acceptance: float
     n_draws: int
@@ -118,10 +137,24 @@ class Diagnostics:
     prior_sensitivity: dict[str, float]
     likelihood_sensitivity: dict[str, float]
     prior_dominated: tuple[str, ...]
+    residuals: Residuals = field(repr=False, compare=False)
+    checks: Table = field(repr=False, compare=False)
+
+    @property
+    def sources(self) -> Table:
+        """How well every source agrees with the counts, see `analysis.sources.source_table`."""
+        return self.residuals.sources
 
     @property
     def trustworthy(self) -> bool:
-        """Whether the run is sampled well and its model fits the counts."""
+        """Whether the model fits the counts, and the draws represent the posterior.
+
+        They do where the run is sampled well; those of a Laplace approximation where the MAP is at
+        the maximum and the importance efficiency is at least 0.8.
+        """
+        if self.sampled_well is None:
+            close = self.importance_efficiency >= MIN_EFFICIENCY
+            return self.fits_data and self.at_maximum and close
         return self.sampled_well and self.fits_data
 
     @property
@@ -137,19 +170,22 @@ class Diagnostics:
         }
 
 
-def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
+def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -> Diagnostics:
     """Judge how a chain is sampled, whether its model fits the counts, and what its prior does.
 
     Sampled well means: largest R-hat at most 1.01, every bulk and tail effective sample size at
     least `target_ess`, at least one move in ten accepted, and a MAP at which the gradient vanishes.
     The model fits where the deviance at the MAP is within 5 standard deviations of its expectation.
+    Of draws of the Laplace approximation the importance efficiency is judged instead.
 
     Parameters
     ----------
     chain : Chain
-        A finished or running chain.
+        A finished or running chain, or one that `laplace` made.
     target_ess : float, optional
         Effective draws demanded of every parameter.
+    predictive : int, optional
+        Number of draws, 50 say, at which a frame is simulated for posterior predictive checks.
 
     Returns
     -------
@@ -164,36 +200,61 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape
-    rhat, bulk, tail = convergence(kept)
-    walkers = kept.transpose(3, 0, 2, 1).reshape(len(names), n_ensembles * n_walkers, n_steps)
-    tau = np.array([autocorrelation_time(series) for series in walkers])
-    total_steps = max(chain.chain.shape[1], 1)
-    acceptance = float(np.mean(chain.accepted)) / total_steps
-    failures = _failures(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
+    sampled = chain.method == "mcmc"
+    if sampled:
+        rhat, bulk, tail = convergence(kept)
+        walkers = kept.transpose(3, 0, 2, 1).reshape(len(names), n_ensembles * n_walkers, n_steps)
+        tau = np.array([autocorrelation_time(series) for series in walkers])
+        acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
+        efficiency = np.nan
+        failures = _failures(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
+        sampling = (
+            f"Not sampled well: {'; '.join(failures)}."
+            if failures
+            else f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
+            f"{min(bulk.min(), tail.min()):.0f}, acceptance {acceptance:.1%}."
+        )
+    else:
+        rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
+        acceptance, efficiency = np.nan, importance_efficiency(chain)
+        failures = _approximation_failures(efficiency, chain)
+        sampling = (
+            f"Not sampled, and errors of the Laplace approximation do not hold: "
+            f"{'; '.join(failures)}."
+            if failures
+            else "Not sampled: errors are those of the information at the maximum (importance "
+            f"efficiency {efficiency:.0%})."
+        )
     fit = fit_statistics(posterior, chain.estimate.params)
     fits_data = abs(misfit(fit)) <= CONSISTENT
-    message = f"{'not ' if failures or not fits_data else ''}trustworthy: {_fit_sentence(fit)} " + (
-        f"Not sampled well: {'; '.join(failures)}."
-        if failures
-        else f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
-        f"{min(bulk.min(), tail.min()):.0f}, acceptance {acceptance:.1%}."
-    )
+    trusted = "not " if failures or not fits_data else ""
+    message = f"{trusted}trustworthy: {_fit_sentence(fit)} {sampling}"
+    residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
+    checks = [*_sums(fit), *residuals.checks]
+    if predictive:
+        draws = _draws(chain)
+        some = np.linspace(0, len(draws) - 1, min(predictive, len(draws))).astype(int)
+        checks += predictive_checks(posterior, draws[some], seed=chain.seed)
     prior, likelihood = _sensitivities(chain, posterior)
     dominated = prior >= INFORMATIVE
     dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
     return Diagnostics(
-        sampled_well=not failures,
+        sampled_well=not failures if sampled else None,
         fits_data=fits_data,
         message=message,
         rhat=_by_name(names, rhat),
         ess_bulk=_by_name(names, bulk),
         ess_tail=_by_name(names, tail),
+        importance_efficiency=float(efficiency),
+        at_maximum=chain.estimate.at_maximum,
         tau=_by_name(names, tau),
         acceptance=acceptance,
         n_draws=n_ensembles * n_steps * n_walkers,
         prior_sensitivity=_by_name(names, prior),
         likelihood_sensitivity=_by_name(names, likelihood),
         prior_dominated=tuple(np.array(names)[dominated].tolist()),
+        residuals=residuals,
+        checks=check_table(checks),
         **fit,
     )
 
@@ -293,6 +354,20 @@ def _by_name(names: tuple[str, ...], values: Floats) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
+def _sums(fit: Mapping[str, float]) -> list[Check]:
+    """Pearson's statistic and the deviance."""
+    meanings = {
+        "Pearson": "sum of squared residuals in standard deviations",
+        "deviance": "twice the log-likelihood that a perfect model would gain",
+    }
+    checks = []
+    for name, meaning in meanings.items():
+        value, expected, sd = (fit[f"{name.lower()}{part}"] for part in ("", "_expected", "_sd"))
+        z = (value - expected) / sd if sd > 0.0 else float("nan")
+        checks.append(Check(name, value, expected, sd, z, meaning))
+    return checks
+
+
 def _fit_sentence(fit: Mapping[str, float]) -> str:
     """Say whether the model fits the counts."""
     excess = misfit(fit)
@@ -318,6 +393,21 @@ def _failures(
         )
     if not acceptance >= MIN_ACCEPTANCE:
         failures.append(f"acceptance {acceptance:.1%} is below {MIN_ACCEPTANCE:.0%}")
-    if not chain.estimate.at_maximum:
-        failures.append(f"the MAP is not at the maximum ({chain.estimate.message})")
+    return failures + _not_at_maximum(chain)
+
+
+def _approximation_failures(efficiency: float, chain: Chain) -> list[str]:
+    """What is wrong with the Laplace approximation."""
+    failures = _not_at_maximum(chain)
+    if not efficiency >= MIN_EFFICIENCY:
+        failures.append(
+            f"the posterior is not normal (importance efficiency {efficiency:.0%} is below "
+            f"{MIN_EFFICIENCY:.0%}): sample it"
+        )
     return failures
+
+
+def _not_at_maximum(chain: Chain) -> list[str]:
+    if chain.estimate.at_maximum:
+        return []
+    return [f"the MAP is not at the maximum ({chain.estimate.message})"]

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import spatial
 
 from bayesfred._typing import Flags, Floats
+from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.parameters import displacing
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
@@ -45,14 +46,18 @@ class FieldPoints(NamedTuple):
     ----------
     u, v : ndarray, shape (rows, columns), pixel of the fine grid
         From one edge of the frame to the other.
+    hull : ndarray, shape (n, 2), pixel of the fine grid
+        Vertices of the convex hull of the sources' images, counterclockwise; none if there are
+        fewer than three images, or all are on a line.
     inside : ndarray of bool, shape (rows, columns)
-        Whether a point lies within the convex hull of the sources' images.
+        Whether a point lies within it.
     weights : ndarray, shape (rows, columns)
         Of the average over the field: 0 outside the hull, unless all points are.
     """
 
     u: Floats
     v: Floats
+    hull: Floats
     inside: Flags
     weights: Floats
 
@@ -127,7 +132,7 @@ def displacement_field(chain: Chain) -> DisplacementField:
     posterior = frame_posterior(chain)
     points = field_points(posterior, chain.estimate.params)
     at = displacement(chain, points.u, points.v)
-    return _field(points, *at, pixel_unit(posterior))
+    return _field(points, *at, pixel_unit(posterior.model))
 
 
 def field_points(posterior: Posterior, params: Floats) -> FieldPoints:
@@ -148,10 +153,11 @@ def field_points(posterior: Posterior, params: Floats) -> FieldPoints:
     longer = max(half_u, half_v)
     columns, rows = (max(2, math.ceil((POINTS - 1) * h / longer) + 1) for h in (half_u, half_v))
     u, v = np.meshgrid(np.linspace(-half_u, half_u, columns), np.linspace(-half_v, half_v, rows))
-    inside = _inside(_images(posterior, params), u, v)
+    hull = _hull(_images(posterior, params))
+    inside = _inside(hull, u, v)
     edge_u, edge_v = (np.isin(np.arange(n), (0, n - 1)) for n in (columns, rows))
     weights = np.where(edge_u, 0.5, 1.0) * np.where(edge_v, 0.5, 1.0)[:, None]
-    return FieldPoints(u, v, inside, weights * inside if inside.any() else weights)
+    return FieldPoints(u, v, hull, inside, weights * inside if inside.any() else weights)
 
 
 def displacement_covariance(
@@ -214,18 +220,18 @@ def rms(weights: Floats, values: Floats) -> float:
     return math.sqrt(np.average(values[known] ** 2, weights=weights[known]))
 
 
-def pixel_unit(posterior: Posterior) -> str:
+def pixel_unit(model: ForwardModel) -> str:
     """What a pixel is called in which displacements are given.
 
     Parameters
     ----------
-    posterior : Posterior
+    model : ForwardModel
 
     Returns
     -------
     str
     """
-    return "px" if posterior.model.detector.binning == 1 else "fine px"
+    return "px" if model.detector.binning == 1 else "fine px"
 
 
 def _sd(covariance: Floats) -> Floats:
@@ -247,14 +253,21 @@ def _images(posterior: Posterior, params: Floats) -> Floats:
     return at[:, kept][:, posterior.mask[row, column]].T
 
 
-def _inside(images: Floats, u: Floats, v: Floats) -> Flags:
-    """Whether points lie within the convex hull of the images."""
+def _hull(images: Floats) -> Floats:
+    """Vertices of the convex hull, counterclockwise, shape (n, 2)."""
     try:
-        hull = spatial.ConvexHull(images)
+        return np.asarray(images[spatial.ConvexHull(images).vertices])
     except (spatial.QhullError, ValueError):  # fewer than three, or on a line
-        return np.zeros(u.shape, dtype=bool)
-    distance = hull.equations @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
-    return np.asarray((distance <= 1e-9 * np.ptp(images)).all(axis=0).reshape(u.shape))
+        return np.empty((0, 2))
+
+
+def _inside(hull: Floats, u: Floats, v: Floats) -> Flags:
+    """Whether points lie to the left of every edge, or on it."""
+    inside = np.full(u.shape, len(hull) > 0)
+    for (u_0, v_0), (u_1, v_1) in zip(hull, np.roll(hull, -1, axis=0), strict=True):
+        length = math.hypot(u_1 - u_0, v_1 - v_0)
+        inside &= (u_1 - u_0) * (v - v_0) - (v_1 - v_0) * (u - u_0) >= -1e-9 * length
+    return inside
 
 
 def _field(points: FieldPoints, mean: Floats, covariance: Floats, unit: str) -> DisplacementField:

@@ -13,7 +13,9 @@ from scipy.special import ndtr
 
 from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.analysis.executor import Executor, run
+from bayesfred.analysis.field import field_points, pixel_unit, rms
 from bayesfred.analysis.noise_summary import summarise
+from bayesfred.analysis.photons import laplace_error, photons_needed, rounded
 from bayesfred.analysis.study_helpers import (
     Method,
     check,
@@ -27,7 +29,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import Noise, PoissonNoise
-from bayesfred.model.parameters import Nuisances
+from bayesfred.model.parameters import Nuisances, displacing
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 from bayesfred.optimize.fit_statistics import fit_statistics
@@ -68,7 +70,9 @@ class _Levels:
             for name in self.names
             for what in ("truth", "estimate", "sd", "bound", "pit")
         )
-        return ("replicate", *VARIABLES, "chi2", "lambda", "deviance", "theta.distance", *each)
+        field = ("displacement.error", "displacement.predicted")
+        whole = ("chi2", "lambda", "deviance", "theta.distance", *field)
+        return ("replicate", *VARIABLES, *whole, *each)
 
     def contents(self) -> dict[str, str]:
         posterior, _ = self.cell(0)
@@ -139,8 +143,20 @@ class _Levels:
             fit["background_estimate"],
             deviance,
             distance,
+            *_field_errors(posterior, middle, truth),
             *each.ravel(),
         )
+
+
+def _field_errors(posterior: Posterior, params: Floats, truth: Floats) -> tuple[float, float]:
+    """The rms error over the field of an estimate, and the one that the information predicts."""
+    points = field_points(posterior, truth)
+    theta, offset = displacing(posterior.parameters, np.stack([params, truth]))
+    found = np.array(
+        posterior.model.polynomial.object_position(theta, points.u, points.v, offset=offset)
+    )
+    off = np.sqrt(0.5 * np.sum((found[:, 0] - found[:, 1]) ** 2, axis=0))
+    return rms(points.weights, off), laplace_error(posterior, truth, points)
 
 
 def _spread(sources: SourceCatalog, n: int) -> npt.NDArray[np.intp]:
@@ -173,7 +189,8 @@ class NoiseStudy:
     replicates : dict of str to ndarray
         That table: `task`, `replicate`, the cell's variables, chi2, lambda, the deviance in
         standard deviations, the distance of theta from its truth in the metric of the bound,
-        squared; and for every parameter its truth, estimate, sd, bound and PIT (the posterior
+        squared; the rms error of the displacement over the field and its predicted value, pixel;
+        and for every parameter its truth, estimate, sd, bound and PIT (the posterior
         probability of values below the truth); `message` says why a frame has no numbers.
     cells : dict of str to ndarray
         A row for every cell and parameter, and one for theta as a whole: see `noise_study`.
@@ -210,6 +227,7 @@ def noise_study(
     resume: bool = False,
     overwrite: bool = False,
     progress: bool = True,
+    error: float = 0.01,
 ) -> NoiseStudy:
     """Fit many simulated frames at every cell of a grid of noise levels.
 
@@ -220,7 +238,10 @@ def noise_study(
     efficiency (bound^2 / scatter^2), coverage_68 and coverage_95, the shares of frames whose
     central intervals hold the truth. `_error` is the Monte Carlo error. In the row `theta`,
     efficiency is the number of coefficients over their mean squared distance from the truth in the
-    metric of the bound, and coverage the mean of theirs.
+    metric of the bound, and coverage the mean of theirs; displacement_rms is the rms error of the
+    displacement over the field and over the frames, along one axis, displacement_predicted what
+    Fisher information and prior say it is, and photons the mean flux of the sources at which that
+    would be `error`, over the same background.
 
     Parameters
     ----------
@@ -257,6 +278,8 @@ def noise_study(
         Replace the file.
     progress : bool
         Show a progress bar on standard error.
+    error : float, pixel of the fine grid
+        The rms error of the displacement over the field for which photons are counted.
 
     Returns
     -------
@@ -306,7 +329,7 @@ def noise_study(
         "psf_sigma": psf_sigma or [model.psf.sigma],
         "exposure": exposure or [1.0],
     }
-    for name, values in given.items():
+    for name, values in (*given.items(), ("error", [error])):
         for value in values:
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"noise study: {name}: got {value}, expected a number > 0")
@@ -349,7 +372,8 @@ def noise_study(
         progress=progress,
     )
     rows = record.columns
-    summary = summarise(study.names, len(study.theta), study.cells, rows)
+    photons = [photons_needed(*study.cell(j), error).flux for j in range(len(cells))]
+    summary = summarise(study.names, len(study.theta), study.cells, rows, photons)
     whole = (summary["parameter"] == "theta") & (summary["frames"] > 1)
     message = (
         f"{rows['task'].size} frames, "
@@ -361,4 +385,12 @@ def noise_study(
             f"; efficiency {efficiency.min():.2f} to {efficiency.max():.2f} of the Cramer-Rao bound"
         )
         message += f", 68 % intervals hold {coverage.min():.1%} to {coverage.max():.1%}"
+    message += f"; {_photons_sentence(model, error, photons)}"
     return NoiseStudy(Path(path), study.names, rows, summary, message)
+
+
+def _photons_sentence(model: ForwardModel, error: float, photons: Sequence[float]) -> str:
+    """How bright sources have to be at the noise levels of a study."""
+    low, high = (rounded(value) for value in (min(photons), max(photons)))
+    flux = low if low == high else f"{low} to {high}"
+    return f"for an error of {error:g} {pixel_unit(model)} rms: sources of {flux} photons"

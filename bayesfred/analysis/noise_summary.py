@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.study_helpers import LEVELS, coverage_error, covered
 
 __all__ = ["summarise"]
@@ -18,6 +18,7 @@ def summarise(
     n_terms: int,
     cells: Sequence[Mapping[str, float]],
     rows: Mapping[str, npt.NDArray[Any]],
+    photons: Sequence[float],
 ) -> dict[str, npt.NDArray[Any]]:
     """Summarise what the frames of every cell say of every parameter, and of theta as a whole.
 
@@ -31,6 +32,8 @@ def summarise(
         The noise levels of every cell.
     rows : mapping of str to ndarray
         The table of all frames, `NoiseStudy.replicates`.
+    photons : sequence of float
+        Mean flux of the sources that the wanted error takes, of every cell.
 
     Returns
     -------
@@ -62,7 +65,12 @@ def summarise(
             "efficiency": efficiency,
             "efficiency_error": efficiency * math.sqrt(2.0 / max(n * d, 1)),
         }
-        table.append({**head, "parameter": "theta", **unknown, **whole, **_coverage(every)})
+        table.append(
+            {
+                **head, "parameter": "theta", **unknown, **whole, **_coverage(every),
+                **_displacement(rows, mine), "photons": photons[j],
+            }
+        )  # fmt: skip
         for name in names:
             truth, estimate, sd, bound, pit = (
                 rows[f"{name}.{w}"][mine] for w in ("truth", "estimate", "sd", "bound", "pit")
@@ -83,7 +91,22 @@ def summarise(
                 "efficiency_error": efficiency * math.sqrt(2.0 / max(n - 1, 1)),
             }
             table.append({**head, "parameter": name, **own, **_coverage(pit[:, None])})
-    return {key: np.array([row[key] for row in table]) for key in table[0]}
+    return {key: np.array([row.get(key, math.nan) for row in table]) for key in table[0]}
+
+
+def _displacement(rows: Mapping[str, npt.NDArray[Any]], mine: Flags) -> dict[str, float]:
+    """The rms error of the displacement over field and frames, its own error, and its prediction.
+
+    The error of a root mean square is that of the mean square over twice the root.
+    """
+    square, error = _mean(rows["displacement.error"][mine] ** 2)
+    predicted, _ = _mean(rows["displacement.predicted"][mine] ** 2)
+    root = math.sqrt(square)
+    return {
+        "displacement_rms": root,
+        "displacement_rms_error": error / (2.0 * root) if root else 0.0,
+        "displacement_predicted": math.sqrt(predicted),
+    }
 
 
 def _mean(values: Floats) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 
-__all__ = ["PhotonsNeeded", "photons_needed"]
+__all__ = ["PhotonsNeeded", "laplace_error", "photons_needed", "rounded"]
 
 WIDEST = 1e6  # largest factor, either way
 MOST_PHOTONS = 2.0**53  # of a source: a catalogue holds no more
@@ -103,7 +103,7 @@ def photons_needed(posterior: Posterior, params: npt.ArrayLike, error: float) ->
     @functools.cache
     def excess(log_factor: float) -> float:
         brighter = _brighter(posterior, params, math.exp(log_factor) * fluxes)
-        return math.log(_error(brighter, params, points) / error)
+        return math.log(laplace_error(brighter, params, points) / error)
 
     low = -math.log(WIDEST)
     high = min(-low, math.log(MOST_PHOTONS / fluxes.max()))
@@ -149,23 +149,51 @@ def _brighter(posterior: Posterior, params: Floats, fluxes: Floats) -> Posterior
     )
 
 
-def _error(posterior: Posterior, params: Floats, points: FieldPoints) -> float:
-    """The rms error over the field in the Laplace approximation, pixel."""
+def laplace_error(posterior: Posterior, params: Floats, points: FieldPoints) -> float:
+    """The rms error over the field that Fisher information and prior predict.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+    points : FieldPoints
+
+    Returns
+    -------
+    float, pixel
+    """
     covariance = inverse(posterior.information(params))
     return field_error(
         points, displacement_covariance(posterior, params, covariance, points.u, points.v)
     )
 
 
+def rounded(value: float) -> str:
+    """A number to three digits, without an exponent.
+
+    Parameters
+    ----------
+    value : float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> rounded(4382123.4), rounded(0.0248)
+    ('4,380,000', '0.0248')
+    """
+    return f"{float(f'{value:.3g}'):,.10g}"
+
+
 def _sentence(posterior: Posterior, error: float, factor: float, flux: float) -> str:
-    wanted = f"For an error of {error:g} {pixel_unit(posterior)} rms"
+    wanted = f"For an error of {error:g} {pixel_unit(posterior.model)} rms"
     if math.isinf(factor):
         return f"{wanted}: no number of photons is enough."
     if factor == 0.0:
         return f"{wanted}: no photons are needed, the prior is that narrow."
-    # three digits: the factor is no better known than the model is
-    rounded = float(f"{flux:.3g}")
     return (
-        f"{wanted}: sources of {rounded:,.10g} photons on average, {float(f'{factor:.3g}'):,.10g} "
-        "times as bright, over the same background."
+        f"{wanted}: sources of {rounded(flux)} photons on average, {rounded(factor)} times as "
+        "bright, over the same background."
     )

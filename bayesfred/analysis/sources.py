@@ -31,6 +31,7 @@ J. Anderson, I. R. King (2000), PASP 112, 1360: fits of stars with the derivativ
 P. McCullagh, J. A. Nelder (1989), Generalized Linear Models, chapter 2: Fisher's scoring.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +42,7 @@ from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.kernels.sources import OwnPixels, fit_templates
 from bayesfred.model.posterior import Posterior
 
-__all__ = ["source_table"]
+__all__ = ["SourceFits", "fit_sources", "source_table", "tabulate"]
 
 WIDTHS = 3.0  # radius of a source's own pixels, in widths of the PSF
 REACH = 0.75  # pixel, added so that the pixel of the image's middle is always among them
@@ -50,7 +51,7 @@ ALONE = 0.01  # share of a source's light that others may have among its pixels
 BLOCK = 2**18  # samples
 
 
-class _Sums(NamedTuple):
+class SourceSums(NamedTuple):
     """Sums over each source's pixels, shape (s,), and what every sample enters a fit with."""
 
     deviance: Floats
@@ -60,6 +61,45 @@ class _Sums(NamedTuple):
     others: Floats  # light of other sources
     weight: Floats  # (samples,)
     pull: Floats  # (samples,) weight times residual
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFits:
+    """What the counts say of every source; lengths in fine pixels.
+
+    Attributes
+    ----------
+    own : OwnPixels
+        Every source's pixels, a sample each, and its templates there.
+    owner : ndarray, shape (samples,)
+        The source of every sample.
+    expected : ndarray, shape (ny, nx), counts per pixel
+        The model.
+    fluxes : ndarray, shape (s,), counts
+        As the model has them.
+    sums : SourceSums
+        Of the counts against the model.
+    information : ndarray, shape (s, 4, 4)
+        About the coefficients of a source's own templates.
+    found, covariance : ndarray, shape (s, 4) and (s, 4, 4)
+        L, the shifts along a and b, and the logarithm of the width's ratio.
+    moved, moved_covariance : ndarray, shape (s, 2) and (s, 2, 2)
+        Displacements of the images along u and v from where the distortion has them.
+    to_image : ndarray, shape (s, 2, 2)
+        Displacement of the image by a shift along a and b.
+    """
+
+    own: OwnPixels
+    owner: Ints
+    expected: Floats
+    fluxes: Floats
+    sums: SourceSums
+    information: Floats
+    found: Floats
+    covariance: Floats
+    moved: Floats
+    moved_covariance: Floats
+    to_image: Floats
 
 
 def source_table(posterior: Posterior, params: Floats) -> Table:
@@ -101,55 +141,91 @@ def source_table(posterior: Posterior, params: Floats) -> Table:
     >>> [round(float(table[name][0]), 2) for name in ("flux_ratio", "du", "width_ratio")]
     [1.2, 0.1, 1.0]
     """
-    model, likelihood = posterior.model, posterior.likelihood
+    return tabulate(posterior, fit_sources(posterior, params))
+
+
+def fit_sources(posterior: Posterior, params: Floats) -> SourceFits:
+    """Fit what may be wrong with every source.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+
+    Returns
+    -------
+    SourceFits
+    """
+    model = posterior.model
     named = dict(zip(posterior.parameter_names, np.asarray(params).tolist(), strict=True))
-    step = float(model.detector.binning)
-    radius = WIDTHS * named.get("psf_sigma", model.psf.sigma) + REACH * step
-    own, expected, fluxes, shifts = likelihood.own_pixels(params, radius)
+    sigma = named.get("psf_sigma", model.psf.sigma)
+    radius = WIDTHS * sigma + REACH * float(model.detector.binning)
+    own, expected, fluxes, shifts = posterior.likelihood.own_pixels(params, radius)
     owner = np.repeat(np.arange(fluxes.size), np.diff(own.first))
     sums = _sum_up(posterior, (own, owner), expected.ravel(), named["background"])
     near = _neighbours(own, radius)
-    found, covariance = _per_light(*fit_templates(own, sums.weight, sums.pull, near))
+    found, covariance, information = fit_templates(own, sums.weight, sums.pull, near)
+    found, covariance = _per_light(found, covariance)
     slopes = np.where(np.isfinite(own.image[:, :1]), own.slopes, np.eye(2).ravel())
     to_image = np.linalg.inv(slopes.reshape(-1, 2, 2))
-    moved = np.einsum("sij,sj->si", to_image, shifts + found[:, 1:3])
-    moved_covariance = to_image @ covariance[:, 1:3, 1:3] @ to_image.swapaxes(1, 2)
-    size = np.diff(own.first)
+    return SourceFits(
+        own, owner, expected, fluxes, sums, information, found, covariance,
+        moved=np.einsum("sij,sj->si", to_image, shifts + found[:, 1:3]),
+        moved_covariance=to_image @ covariance[:, 1:3, 1:3] @ to_image.swapaxes(1, 2),
+        to_image=to_image,
+    )  # fmt: skip
+
+
+def tabulate(posterior: Posterior, fits: SourceFits) -> Table:
+    """The table of `source_table` from fits that are at hand.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    fits : SourceFits
+        What `fit_sources` found.
+
+    Returns
+    -------
+    astropy.table.Table
+    """
+    model, own, sums, found = posterior.model, fits.own, fits.sums, fits.found
+    step, size = float(model.detector.binning), np.diff(own.first)
     spread = np.sqrt(np.where(size > 0, sums.variance, np.nan))
     middle = 0.5 * (np.array(model.detector.shape[::-1]) - 1.0)
     image = own.image / step
     phase = image + middle - np.rint(image + middle)
-    total = np.bincount(owner, own.templates[0], fluxes.size)
+    light = np.bincount(fits.owner, own.templates[0], size.size)
     return make_table(
         {
-            "id": np.arange(fluxes.size),
+            "id": np.arange(size.size),
             "x": model.sources.x,
             "y": model.sources.y,
             "u": image[:, 0],
             "v": image[:, 1],
-            "flux": fluxes,
+            "flux": fits.fluxes,
             "n_pixels": size,
             "chi2": np.where(size > 0, sums.deviance, np.nan),
             "chi2_z": (sums.deviance - sums.expected) / spread,
             "flux_ratio": found[:, 0],
-            "flux_ratio_sd": np.sqrt(covariance[:, 0, 0]),
-            "du": moved[:, 0] / step,
-            "dv": moved[:, 1] / step,
-            "du_sd": np.sqrt(moved_covariance[:, 0, 0]) / step,
-            "dv_sd": np.sqrt(moved_covariance[:, 1, 1]) / step,
+            "flux_ratio_sd": np.sqrt(fits.covariance[:, 0, 0]),
+            "du": fits.moved[:, 0] / step,
+            "dv": fits.moved[:, 1] / step,
+            "du_sd": np.sqrt(fits.moved_covariance[:, 0, 0]) / step,
+            "dv_sd": np.sqrt(fits.moved_covariance[:, 1, 1]) / step,
             "width_ratio": 1.0 + found[:, 3],
-            "width_ratio_sd": np.sqrt(covariance[:, 3, 3]),
+            "width_ratio_sd": np.sqrt(fits.covariance[:, 3, 3]),
             "peak": sums.peak,
             "phase_u": phase[:, 0],
             "phase_v": phase[:, 1],
-            "isolated": (sums.others <= ALONE * total) & (size > 0),
+            "isolated": (sums.others <= ALONE * light) & (size > 0),
         }
     )
 
 
 def _sum_up(
     posterior: Posterior, pixels: tuple[OwnPixels, Ints], expected: Floats, level: float
-) -> _Sums:
+) -> SourceSums:
     """Compare the counts of all sources' pixels with their expectation."""
     (own, owner), counts = pixels, posterior.counts.ravel()
     size, profiled = own.first.size - 1, posterior.nuisances.profiled
@@ -180,7 +256,7 @@ def _sum_up(
     if profiled:  # a fitted flux removes what is along its own template
         variance -= np.divide(slope**2, information, np.zeros(size), where=information > 0.0)
     peak[np.diff(own.first) == 0] = np.nan
-    return _Sums(deviance, mean - profiled, variance, peak, others, weight, pull)
+    return SourceSums(deviance, mean - profiled, variance, peak, others, weight, pull)
 
 
 def _neighbours(own: OwnPixels, radius: float) -> tuple[Ints, Ints]:

@@ -22,6 +22,7 @@ from bayesfred.sampling.chainfile import (
     open_chain,
     stored_fingerprint,
 )
+from bayesfred.sampling.laplace import laplace
 from bayesfred.sampling.moves import LaplaceMove
 from bayesfred.sampling.sampler import sample
 
@@ -59,13 +60,15 @@ def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
     """
     chain = open_chain(path)
     posterior = chain.posterior()
-    near = posterior.near(chain.estimate.params, chain.estimate.covariance)  # as in the run
+    if chain.method == "laplace":
+        computed = [*_maximum(chain, posterior), _laplace_draws(chain)]
+    else:
+        near = posterior.near(chain.estimate.params, chain.estimate.covariance)  # as in the run
+        computed = [_log_prob(chain, near, every_draw), *_maximum(chain, posterior), *_steps(chain)]
     return [
         Check("file", f"SHA-256 {stated_digest(path)}", True),  # it has been opened
         _posterior(path, posterior),
-        _log_prob(chain, near, every_draw),
-        *_maximum(chain, posterior),
-        *_steps(chain),
+        *computed,
     ]
 
 
@@ -165,6 +168,23 @@ def _steps(chain: Chain) -> list[Check]:
             np.array_equal(moved, chain.accepted),
         ),
     ]
+
+
+def _laplace_draws(chain: Chain) -> Check:
+    """All draws of a Laplace approximation made again, with its log-density there."""
+    n = chain.log_prob.size
+    try:
+        again = laplace(chain.posterior(), chain.estimate, seed=chain.seed, draws=n)
+    except InputError as error:
+        return Check("draws", str(error), False)
+    sd = np.sqrt(np.diag(chain.estimate.covariance))
+    off = float((np.abs(again.chain - chain.chain) / sd).max())
+    off_log, share = _farthest(again.log_prob.ravel(), chain.log_prob.ravel())
+    finding = (
+        f"{n} drawn again from seed {chain.seed}: differ by at most {off:.1g} standard "
+        f"deviations, their log-densities by at most {off_log:.2g}"
+    )
+    return Check("draws", finding, off <= ROUNDING and share <= 1.0)
 
 
 def _moved(chain: Floats) -> Ints:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bayesfred._typing import Flags, Floats
+from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Optics, stride
 from bayesfred.imaging.kernels.render import render as render_sources
@@ -167,7 +168,6 @@ class FrameLikelihood:
         Parameters
         ----------
         params : ndarray, shape (d,)
-            Where the likelihood is positive.
         radius : float, fine pixel
             Distance in the coordinates (a, b) of the PSF within which a pixel is a source's own.
 
@@ -178,8 +178,18 @@ class FrameLikelihood:
         fluxes : ndarray, shape (s,), counts
         shifts : ndarray, shape (s, 2), fine pixel
             Most likely shifts along a and b; zero unless positions scatter.
+
+        Raises
+        ------
+        InputError
+            Where the likelihood is zero because the map folds.
         """
         with self._rendered(params) as (w, rendered, parameters):
+            if not rendered.extra > -np.inf:
+                raise InputError(
+                    "params: got parameters that leave a source without an image, expected ones "
+                    "of a positive likelihood, such as those of find_map"
+                )
             fluxes, profiled = rendered.fluxes, rendered.profiled
             shifts = np.zeros((fluxes.size, 2)) if profiled is None else profiled.shifts
             optics = self._optics._replace(support_radius=radius / parameters.nuisances.psf_sigma)

@@ -12,6 +12,7 @@ from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.determined import undetermined
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
+from bayesfred.optimize.matched import source_light
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
@@ -149,11 +150,11 @@ def _search(
             again = maximize(kept.posterior, origin, information=known)
             evaluations += spent + again.evaluations
             if top is None or again.distance < CLOSENESS:
-                top, found, how = again, kept, _how(posterior, begun)
+                top, found, path = again, kept, begun.path
             if again.distance < CLOSENESS:
                 break
         assert top is not None, "a first start"
-        return found.posterior, _judged(posterior, found.posterior, top, evaluations, how)
+        return found.posterior, _judged(posterior, found.posterior, top, evaluations, path)
 
 
 def _require_determined(posterior: Posterior, params: Floats, fisher: Floats) -> None:
@@ -176,15 +177,16 @@ def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Ite
 
 
 def _judged(
-    given: Posterior, posterior: Posterior, top: NewtonResult, evaluations: int, how: str
+    given: Posterior, posterior: Posterior, top: NewtonResult, evaluations: int, path: str
 ) -> MapEstimate:
     """The maximum of what is kept of the given posterior, and whether the model fits there."""
+    matched, sources = source_light(posterior, top.params).matched, len(posterior.model.sources)
+    how = f"{path and f' from {path}'}, {matched.sum()} of {sources} sources matched"
     excess = misfit(fit_statistics(posterior, top.params))
     rejecting = posterior is not given
     if rejecting:
-        sources = len(given.model.sources) - len(posterior.model.sources)
         pixels = given.mask.sum() - posterior.mask.sum()
-        how += f", {sources} sources and {pixels} pixels rejected"
+        how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
     return _estimate(posterior, top, evaluations, how, excess, _advice(excess, rejecting))
 
 
@@ -213,13 +215,6 @@ def _estimate(
     return MapEstimate(
         top.params, top.covariance, top.log_prob, evaluations, message, at_maximum, fits
     )
-
-
-def _how(posterior: Posterior, begun: Start) -> str:
-    if not begun.path:
-        return ""
-    sources = len(posterior.model.sources)
-    return f" from {begun.path}, {begun.matched} of {sources} sources matched"
 
 
 def _advice(excess: float, rejecting: bool) -> str:

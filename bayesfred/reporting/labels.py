@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from bayesfred._typing import Floats
+from bayesfred.errors import printable
 from bayesfred.model.parameters import Parameter
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "math_symbol",
     "power_of_ten",
     "scale_of",
+    "with_error",
 ]
 
 
@@ -97,6 +99,31 @@ def scale_of(value: float, sd: float) -> Scale:
     return Scale(exponent, max(0, 1 - digits + exponent))
 
 
+def with_error(value: float, sd: float) -> str:
+    """A value with its standard deviation, to two digits of the latter.
+
+    Parameters
+    ----------
+    value, sd : float
+        In one unit.
+
+    Returns
+    -------
+    str
+        Empty where the value is not finite.
+
+    Examples
+    --------
+    >>> with_error(-5.1234, 0.0213), with_error(1.234e-5, 2e-7)
+    ('-5.123 +- 0.021', '1.234 +- 0.020 e-05')
+    """
+    if not math.isfinite(value):
+        return ""
+    scale = scale_of(value, sd)
+    power = f" e{scale.exponent:+03d}" if scale.exponent else ""
+    return f"{scale.number(value)} +- {scale.number(sd)}{power}"
+
+
 def math_symbol(parameter: Parameter) -> str:
     """A parameter's symbol as mathematics, for matplotlib.
 
@@ -168,7 +195,7 @@ def html_symbol(parameter: Parameter) -> Markup:
     <i>f</i><sub>ux<sup>2</sup></sub>
     """
     if not parameter.letter:
-        return Markup("{}").format(parameter.name.replace("_", " "))
+        return Markup("{}").format(printable(parameter.name.replace("_", " ")))
     powers = Markup("").join(_raised(variable, power) for variable, power in parameter.powers)
     return Markup("<i>{}</i><sub>{}</sub>").format(parameter.letter, powers)
 

@@ -1,5 +1,6 @@
 """Results as tables for a terminal. They are only formatted here; `bayesfred.cli` prints them."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,10 +11,11 @@ from rich.table import Table
 from bayesfred.analysis.comparison import Comparison
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
+from bayesfred.analysis.photons import rounded
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import printable
-from bayesfred.reporting.labels import scale_of
+from bayesfred.reporting.labels import scale_of, with_error
 
 __all__ = [
     "check_table",
@@ -41,19 +43,19 @@ def parameter_table(summary: Any) -> Table:
     with_truth = "truth" in summary.colnames
     heads = ["MAP", "posterior mean +- sd"]
     table = _table(
-        "coefficient", *(["truth", *heads, "z"] if with_truth else heads),
-        "R-hat", "ESS", "prior sens.",
+        "parameter", *(["truth", *heads, "z"] if with_truth else heads),
+        "px at corner", "R-hat", "ESS", "prior",
     )  # fmt: skip
     for row in summary:
         scale = scale_of(row["mean"], row["sd"])
         power = f" e{scale.exponent:+03d}" if scale.exponent else ""
-        mean, sd = scale.number(row["mean"]), scale.number(row["sd"])
-        cells = [scale.number(row["MAP"]) + power, f"{mean} +- {sd}{power}"]
+        cells = [scale.number(row["MAP"]) + power, with_error(row["mean"], row["sd"])]
         if with_truth:
             cells = [scale.number(row["truth"]) + power, *cells, f"{row['z']:+.2f}"]
         table.add_row(
             row["name"],
             *cells,
+            with_error(row["corner"], row["corner_sd"]),
             f"{row['rhat']:.3f}",
             f"{min(row['ess_bulk'], row['ess_tail']):.0f}",
             f"{row['prior_sensitivity']:.3f}",
@@ -77,23 +79,32 @@ def study_table(result: NoiseStudy | PosteriorCalibration) -> Table:
         rows = {key: values[whole] for key, values in result.cells.items()}
         heads = [name for name in VARIABLES if len(set(rows[name])) > 1] or ["background"]
         heads += ["frames", "failed"]
-        shown = ["efficiency", "coverage_68", "coverage_95", "chi2", "lambda"]
+        shown = ["displacement_rms", "displacement_predicted", "photons"]
+        shown += ["efficiency", "coverage_68", "coverage_95"]
     else:
         rows, heads = result.quantities, ["quantity"]
         shown = ["coverage_68", "coverage_95", "pull", "uniformity"]
-    names = {"coverage_68": "% in 68 %", "coverage_95": "% in 95 %"}
+    names = {
+        "coverage_68": "% in 68 %", "coverage_95": "% in 95 %",
+        "displacement_rms": "rms error / px", "displacement_predicted": "predicted",
+    }  # fmt: skip
     table = Table()
     for head in (*heads, *shown):
         table.add_column(names.get(head, head), justify="right", no_wrap=True)
 
     def cell(key: str, k: int) -> str:
         value = rows[key][k]
-        if key in ("chi2", "uniformity"):
+        if key in ("uniformity", "displacement_predicted"):
             return f"{value:.3g}"
+        if key == "photons":
+            return rounded(value)
         if f"{key}_error" not in rows:
             return f"{value:g}" if rows[key].dtype.kind == "f" else str(value)
-        factor, digits = (100.0, 1) if "coverage" in key else (1.0, 3)
-        return f"{factor * value:.{digits}f} ± {factor * rows[f'{key}_error'][k]:.{digits}f}"
+        error = rows[f"{key}_error"][k]
+        factor, digits = (100.0, 1) if "coverage" in key else (1.0, 2)
+        if key == "displacement_rms" and error > 0.0:  # the error to one digit
+            digits = max(0, -math.floor(math.log10(error)))
+        return f"{factor * value:.{digits}f} ± {factor * error:.{digits}f}"
 
     for k in range(len(rows[heads[0]])):
         table.add_row(*(cell(key, k) for key in (*heads, *shown)))

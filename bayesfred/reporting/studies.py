@@ -35,7 +35,7 @@ VARIABLE_LABELS = {
 
 
 def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
-    """Every parameter's width over the noise level with the bound, the efficiency, and coverage.
+    """Every parameter's width over the noise level, the error in pixels, efficiency and coverage.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
     parts: Any = fig.subfigures(2, 1, height_ratios=heights)
     upper, lower = parts
     widths = upper.subplots(rows, columns, squeeze=False, sharex=True).ravel()
-    shares = lower.subplots(1, 2)
+    pixels, *shares = lower.subplots(1, 3)
     for s, label in enumerate(series):
         colour = ENSEMBLE_COLOURS[s % len(ENSEMBLE_COLOURS)]
         for ax, name in zip(widths, names, strict=False):
@@ -76,9 +76,11 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
         mine = np.flatnonzero((cells["parameter"] == "theta") & (of == label))
         # so that points of a noise level do not hide each other
         x = cells[abscissa][mine] * (1.0 + 0.05 * (s - 0.5 * (len(series) - 1)))
-        _shares(shares, x, {key: values[mine] for key, values in cells.items()}, colour)
+        whole = {key: values[mine] for key, values in cells.items()}
+        _shares(shares, x, whole, colour)
+        _pixels(pixels, x, whole, colour)
     every = cells[abscissa]
-    for ax in (*widths[: len(names)], *shares):
+    for ax in (*widths[: len(names)], pixels, *shares):
         ax.set_xscale("log" if every.max() > 3.0 * every.min() else "linear")
         ax.tick_params(labelsize=8)
     labels = {parameter.name: axis_label(parameter, 0) for parameter in parameters}
@@ -97,6 +99,12 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
         ncols=min(len(handles), 6),
         frameon=False,
         fontsize=9,
+    )
+    pixels.set(
+        xlabel=VARIABLE_LABELS[abscissa],
+        ylabel="rms over the field / px",
+        title="error of the displacement",
+        yscale="log",
     )
     lowest = np.nanmin(cells["coverage_68"][cells["parameter"] == "theta"], initial=0.5)
     _name_shares(shares, VARIABLE_LABELS[abscissa], float(lowest) - 0.05)
@@ -124,6 +132,14 @@ def _shares(axes: Sequence[Axes], x: Floats, cells: Mapping[str, Floats], colour
     for level, mark in zip(LEVELS, "os", strict=True):
         key = f"coverage_{100 * level:.0f}"
         coverage.errorbar(x, cells[key], cells[f"{key}_error"], fmt=mark, color=colour, capsize=3)
+
+
+def _pixels(ax: Axes, x: Floats, cells: Mapping[str, Floats], colour: str) -> None:
+    """Predicted and found rms error of the displacement in one series."""
+    order = np.argsort(x)
+    ax.plot(x[order], cells["displacement_predicted"][order], color=colour, linewidth=1.0)
+    found, error = cells["displacement_rms"], cells["displacement_rms_error"]
+    ax.errorbar(x, found, error, fmt="s", mfc="white", color=colour, markersize=4.5)
 
 
 def _name_shares(axes: Sequence[Axes], label: str, low: float) -> None:
@@ -154,7 +170,7 @@ def _noise_handles(series: Sequence[str]) -> list[Line2D]:
     """The legend's entries: what the marks are, and the colour of each series."""
     points: dict[str, Any] = {"linestyle": "", "markersize": 4.5}
     return [
-        Line2D([], [], color="0.3", linewidth=1.0, label="Cramér–Rao bound"),
+        Line2D([], [], color="0.3", linewidth=1.0, label="Cramér–Rao bound, prediction"),
         Line2D([], [], color="0.3", marker="o", label="posterior sd", **points),
         Line2D(
             [], [], color="0.3", marker="s", mfc="white", label="scatter of the estimates", **points

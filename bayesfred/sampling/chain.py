@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import arviz_base
 import numpy.typing as npt
 import xarray as xr
 
@@ -15,7 +14,9 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.io.summary_table import Table
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.datatree import to_datatree
 from bayesfred.sampling.displacement import displacement
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.summary import summary
 
 __all__ = ["Chain", "Method"]
@@ -56,6 +57,8 @@ class Chain:
     method : {"mcmc", "laplace"}
         How the draws were made: by the sampler, or independently from the Laplace approximation,
         see `laplace`.
+    record : RunRecord or None
+        Title, frame, settings, notes and truth of the run, where they were given.
     """
 
     path: Path | None
@@ -71,6 +74,7 @@ class Chain:
     target_ess: float = 1000.0
     n_invalid: int = 0
     method: Method = "mcmc"
+    record: RunRecord | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -132,28 +136,10 @@ class Chain:
         """
         return displacement(self, u, v)
 
-    def to_datatree(self) -> xr.DataTree:
-        """The draws after burn-in for arviz.
+    def to_datatree(self, *, log_likelihood: bool = False) -> xr.DataTree:
+        """The draws after burn-in for arviz, with frame and catalogue, see `datatree`.
 
-        Returns
-        -------
-        xarray.DataTree
-            `posterior` with a variable for each parameter and `sample_stats` with `lp`, of shape
-            (n_ensembles, n_steps * n_walkers): an ensemble is a chain. Its draws are in the order
-            of the steps: those of all walkers after a step, then those after the next.
-
-        Notes
-        -----
-        arviz takes the draws of a chain as one series in time. Its R-hat compares ensembles, and
-        the first half of each with the second, and is the one that the package reports. Its
-        effective sample sizes and Monte Carlo errors assume that draws which are close in the
-        series are the correlated ones. Here the next draw is another walker's, and a walker's own
-        next draw comes `n_walkers` draws later, beyond the lags at which arviz stops to sum. So
-        arviz sees next to nothing of the correlation between steps, and its effective sample
-        sizes are too large: on four ensembles of 32 walkers whose steps have a correlation of 0.9,
-        about 18 times. `summary` has sizes that count it.
+        An ensemble is a chain. With `log_likelihood` that of the pixels of every source is
+        computed too.
         """
-        kept = self.chain[:, self.burn_in :].reshape(len(self.chain), -1, self.chain.shape[3])
-        log_prob = self.log_prob[:, self.burn_in :].reshape(kept.shape[:2])
-        posterior = {name: kept[..., k] for k, name in enumerate(self.parameter_names)}
-        return arviz_base.from_dict({"posterior": posterior, "sample_stats": {"lp": log_prob}})
+        return to_datatree(self, log_likelihood=log_likelihood)

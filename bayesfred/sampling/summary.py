@@ -3,12 +3,13 @@
 The terminal, the page and `Chain.summary` show this table: `bayesfred.reporting` only formats it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bayesfred._typing import Floats
+from bayesfred.imaging.forward import ForwardModel
 from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.parameters import Parameter
 from bayesfred.sampling.convergence import convergence
@@ -43,8 +44,11 @@ def summary(
     astropy.table.Table
         A row for each of the d parameters. Columns: `name`, `unit`; `truth`, if given; `MAP`,
         `mean` and `sd`, the standard deviation with n - 1 in the denominator, all in the
-        parameter's unit; `z`, (mean - truth) / sd, where there is a truth; then `columns`. The sd
-        holds for the stated model and noise: it omits errors of catalogue, PSF and model.
+        parameter's unit; `z`, (mean - truth) / sd, where there is a truth; for a frame `corner` and
+        `corner_sd`, pixel: mean and sd times the displacement that a unit of the parameter makes in
+        that corner of the frame where it makes the largest (u = x, v = y there), nan for what
+        displaces nothing; then `columns`. The sd holds for the stated model and noise: it omits
+        errors of catalogue, PSF and model.
 
     Examples
     --------
@@ -66,6 +70,8 @@ def summary(
     mean, sd = draws.mean(axis=0), draws.std(axis=0, ddof=1)
     # a density that is no frame's has no units
     units = {p.name: unit_text(p) for p in getattr(chain.posterior(), "parameters", ())}
+    model = getattr(chain.posterior(), "model", None)
+    corner = _corner(model, names) if model else np.empty(0)
     given = {} if truth is None else {"truth": np.asarray(truth, dtype=np.float64)}
     with np.errstate(divide="ignore", invalid="ignore"):
         z = {key: (mean - value) / sd for key, value in given.items()}
@@ -85,9 +91,22 @@ def summary(
             "mean": mean,
             "sd": sd,
             **({"z": z["truth"]} if z else {}),
+            **({"corner": corner * mean, "corner_sd": corner * sd} if model else {}),
             **more,
         }
     )
+
+
+def _corner(model: ForwardModel, names: Sequence[str]) -> Floats:
+    """The displacement that a unit of each parameter makes in a corner of the frame, shape (d,).
+
+    It is the length of (f, g) in the corner where that is largest, pixel.
+    """
+    x, y = (0.5 * n * np.array([-1.0, 1.0]) for n in model.detector.fine_shape[::-1])
+    x, y = np.meshgrid(x, y)
+    size = np.linalg.norm(model.polynomial.design_matrix(x, y, x, y), axis=0).max(axis=(0, 1))
+    by_name = dict(zip(model.distortion.names, size, strict=True))
+    return np.array([by_name.get(n, 1.0 if n.startswith("offset_") else np.nan) for n in names])
 
 
 def unit_text(parameter: Parameter) -> str:

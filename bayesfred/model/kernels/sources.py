@@ -205,6 +205,8 @@ def _factor(matrix, vector, known):
 def fit_templates(own, weight, pull, near):
     """Coefficients of every source's templates, shape (s, 4), and covariances, (s, 4, 4).
 
+    The third result is each source's own part of the information, shape (s, 4, 4).
+
     `pull` is w r of the samples, `near` are (firsts, others): the neighbours of source s are
     others[firsts[s]:firsts[s + 1]]. Where a template is not determined its coefficient is nan.
     """
@@ -226,7 +228,7 @@ def fit_templates(own, weight, pull, near):
         _fill_equations(own, weight, members, (projected, squares), (matrix, vector, scale))
         _factor(matrix, vector, known)
         _solve_last(matrix, vector, known, scale, (out[s], covariance[s]))
-    return out, covariance
+    return out, covariance, squares
 
 
 @inner()

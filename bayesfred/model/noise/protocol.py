@@ -76,6 +76,16 @@ class Noise(Protocol):
         ones = np.ones_like(mean)
         return ones, self.pearson_variance(mean, background), 0.0 * ones
 
+    def cumulative(
+        self, counts: Floats, mean: Floats, background: float | Floats, grain: float
+    ) -> tuple[Floats, Floats] | None:
+        """Probabilities of fewer counts than these, and of these or fewer.
+
+        Counts come in steps of `grain`, of which a continuous distribution has the interval around
+        each. None where the model does not say.
+        """
+        return None
+
     def deviance_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Variance of the unit deviance for a background that is known."""
         return self.deviance_moments(mean, background)[1]

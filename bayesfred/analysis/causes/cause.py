@@ -1,0 +1,49 @@
+"""One reason why a model may not fit, as a record."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What is probably wrong.
+
+    Attributes
+    ----------
+    name : str
+        One of "saturation", "gain", "read noise", "pedestal", "over-dispersion", "background",
+        "unmatched", "origin", "parity", "shift", "rotation or scale", "missing terms",
+        "wrong sources", "uncatalogued sources", "fluxes" and "PSF".
+    share : float
+        Part of the misfit that it explains, from 0 to 1; 1 also where nothing can be judged.
+    sentence : str
+        What was found, how much of it, and where.
+    remedy : str
+        What to do.
+    """
+
+    name: str
+    share: float
+    sentence: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A hypothesis that was tried.
+
+    Attributes
+    ----------
+    cause : Cause
+        With the share still to be set.
+    explained : float
+        Sum of squares that it explains.
+    family : str
+        Hypotheses of one family explain the same squares.
+    weight : float
+        Factor below 1 of a hypothesis that contains others and has to explain more than they.
+    """
+
+    cause: Cause
+    explained: float
+    family: str
+    weight: float = 1.0

@@ -1,0 +1,197 @@
+"""Hypotheses about pixels: saturation, the noise's variance, the background."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import ndimage
+
+from bayesfred._typing import Flags, Floats
+from bayesfred.analysis.causes.cause import Cause, Finding
+from bayesfred.analysis.causes.context import Context
+from bayesfred.model.noise import PoissonNoise
+
+FEWEST_FULL = 3  # equal pixels at the top that are a pile
+UNLIKELY = 1e-6  # chance of such a pile
+TILE = 16  # pixels a side of the squares in which the noise is measured
+FEWEST_QUIET = 24  # of a tile's pixels, or it does not count
+FEWEST_TILES = 5
+NOTICEABLE = 5.0  # standard deviations
+
+
+def full_pixels(context: Context) -> tuple[Flags, float]:
+    """Saturated pixels, shape (ny, nx), and the value that they hold.
+
+    Of bright pixels hardly two hold one value: where k pixels have counts within 3 standard
+    deviations below the largest, spread over w possible values, k / w of them hold the largest by
+    chance. A pile has many more.
+    """
+    counts, used = context.posterior.counts, context.posterior.mask
+    none = np.zeros(counts.shape, bool), 0.0
+    values = counts[used]
+    top = float(values.max())
+    scale = float(np.median(context.variance[used])) ** 0.5
+    if top < context.level + 10.0 * scale:
+        return none
+    below = np.unique(values[values > 0.5 * top])
+    step = float(np.diff(below).min()) if below.size > 1 else 1.0
+    sd = max(top, 1.0) ** 0.5 * max(scale / max(context.level, 1.0) ** 0.5, 1.0)
+    near = int(np.sum((values < top) & (values >= top - 3.0 * sd)))
+    pile = int(np.sum(values == top))
+    chance = max(near, 1) * step / (3.0 * sd)
+    # the tail of Poisson's distribution is below its first term times e
+    tail = pile * np.log(chance) - pile * (np.log(pile) - 1.0)
+    if pile < FEWEST_FULL or chance >= pile or tail > np.log(UNLIKELY):
+        return none
+    return used & (counts == top), top
+
+
+def saturation(context: Context) -> tuple[Finding | None, Flags]:
+    """A pile of pixels at one value, and the pixels that they spoil."""
+    full, top = full_pixels(context)
+    if not full.any():
+        return None, full
+    s = context.light.width
+    spoiled = ndimage.distance_transform_edt(~full) <= np.ceil(3.0 * s)
+    held = float(np.sum((context.z**2 - context.used)[spoiled]))
+    touched = np.zeros(context.flux.size, bool)
+    owners = context.owner[full & (context.distance <= 3.0 * s)]
+    touched[owners[owners >= 0]] = True
+    # what sources hold that are not saturated is another cause's
+    others = context.light.matched & ~touched & (context.power > 0.0)
+    like = 0.0
+    if others.any():
+        like = float(context.source_excess[others].sum() / context.power[others].sum())
+    explained = held - max(like, 0.0) * float(context.power[touched].sum())
+    row, column = (int(k[0]) for k in np.nonzero(full))
+    cause = Cause(
+        "saturation", 0.0,
+        f"{full.sum()} pixels at {touched.sum()} sources hold the frame's largest value, {top:g} "
+        f"counts, such as row {row}, column {column}: they are saturated",
+        "mask them: give [frame] saturation",
+    )  # fmt: skip
+    return Finding(cause, explained, "saturation"), np.asarray(spoiled & context.posterior.mask)
+
+
+def background_and_noise(context: Context) -> Iterator[Finding]:
+    """What pixels far from all sources say of the background and of the noise."""
+    mean, scatter, size, place = _tiles(context)
+    if mean.size < FEWEST_TILES:
+        return
+    order = np.argsort(scatter)
+    kept = order[mean.size // 10 : mean.size - mean.size // 10]
+    ratio = float(np.average(scatter[kept], weights=size[kept]))
+    ratio = max(ratio, 1e-9)
+    everywhere = context.used.sum() / max(size.sum(), 1)
+    yield from _background(context, (mean, size, place), ratio, float(everywhere))
+    sd = (2.0 / size[kept].sum()) ** 0.5 * _tail(context)
+    if abs(ratio - 1.0) > NOTICEABLE * max(sd, 1e-9) + 0.02:
+        yield _noise(context, ratio)
+
+
+def _tail(context: Context) -> float:
+    """By how much counts so few scatter more in their squares than normal numbers."""
+    return float(np.sqrt(1.0 + 0.5 / max(np.median(context.variance[context.used]), 1e-3)))
+
+
+def _tiles(context: Context) -> tuple[Floats, Floats, Floats, Floats]:
+    """Mean of z, its variance, number and place of the quiet pixels in every square."""
+    ny, nx = context.quiet.shape
+    row, column = np.nonzero(context.quiet)
+    z = context.z[row, column]
+    across = -(-nx // TILE)
+    tile = row // TILE * across + column // TILE
+    size = np.bincount(tile, minlength=across * -(-ny // TILE)).astype(float)
+    enough = size >= FEWEST_QUIET
+
+    def averaged(values: Floats) -> Floats:
+        return np.asarray(np.bincount(tile, values, size.size)[enough] / size[enough])
+
+    mean, n = averaged(z), size[enough]
+    scatter = (averaged(z**2) - mean**2) * n / (n - 1.0)
+    u, v = averaged(column / max(nx - 1, 1) * 2.0 - 1.0), averaged(row / max(ny - 1, 1) * 2.0 - 1.0)
+    return mean, scatter, n, np.stack([u, v])
+
+
+def _background(
+    context: Context, tiles: tuple[Floats, Floats, Floats], ratio: float, everywhere: float
+) -> Iterator[Finding]:
+    """A background that is not the polynomial that was fitted."""
+    mean, size, (u, v) = tiles
+    held = float(np.sum(size * mean**2) - ratio * mean.size)
+    if held < NOTICEABLE * ratio * (2.0 * mean.size) ** 0.5:
+        return
+    order = context.posterior.nuisances.background_order
+    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    root = np.sqrt(size)
+    found, *_ = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)
+    smooth = float(np.sum((root * (design @ found)) ** 2))
+    by = float(np.ptp(mean) * np.median(context.variance[context.used]) ** 0.5)
+    mends = order < 2 and smooth > 0.5 * held
+    cause = Cause(
+        "background", 0.0,
+        f"the background between the sources differs from the model's by up to {by:.2g} counts a "
+        "pixel from one part of the frame to another",
+        f"set background_order = {2 if order or len(mean) > 20 else 1}" if mends else
+        "subtract a background first, or mask what is not background",
+    )  # fmt: skip
+    yield Finding(cause, held * everywhere, "background")
+
+
+def _noise(context: Context, ratio: float) -> Finding:
+    """Which law of the variance makes the scatter between the sources, and at them.
+
+    With mu the expected counts and b those of the background, the squares of z are `ratio` on the
+    background. At the sources they are `ratio` too if counts are in a wrong unit; 1 + (ratio - 1) b
+    / mu if a variance is missing (read noise) or too much (a pedestal); 1 + (ratio - 1) mu / b if
+    the noise is a share of the counts. The fainter half of the sources decides, for misfits of
+    another kind grow with the flux.
+    """
+    if not isinstance(context.posterior.noise, PoissonNoise):
+        return _finding_of_noise(context, "over-dispersion", ratio, np.ones(1))
+    shift = context.posterior.noise.shift
+    mu, b = context.expected + shift, max(context.level + shift, 1e-9)
+    lit = context.used & (context.distance <= 1.5 * context.light.width) & (mu > 1.5 * b)
+    matched = context.light.matched[context.owner] & lit
+    power = context.power[context.owner]
+    names = ["gain", "read noise" if ratio > 1.0 else "pedestal"]
+    growth = [np.ones(1), b / np.maximum(mu, 1e-9)]
+    if ratio > 1.0:
+        names, growth = [*names, "over-dispersion"], [*growth, mu / b]
+    if not matched.any():
+        return _finding_of_noise(context, names[0], ratio, growth[0])
+    fainter = matched & (power <= np.median(power[matched]))
+    seen = np.log(max(float(np.mean(context.z[fainter] ** 2)), 1e-9))
+    predicted = [
+        np.log(
+            max(float(np.mean(1.0 + (ratio - 1.0) * np.broadcast_to(g, mu.shape)[fainter])), 0.01)
+        )
+        for g in growth
+    ]
+    best = int(np.argmin(np.abs(np.array(predicted) - seen)))
+    return _finding_of_noise(context, names[best], ratio, growth[best])
+
+
+def _finding_of_noise(context: Context, name: str, ratio: float, growth: Floats) -> Finding:
+    part = np.broadcast_to(growth, context.expected.shape)[context.used]
+    explained = abs(ratio - 1.0) * float(np.sum(part))
+    base = max(context.level, 0.0)
+    found = (
+        f"between the sources the counts scatter with {ratio:.3g} times the variance of the noise "
+        f"model at {base:.3g} counts a pixel"
+    )
+    variance = abs(ratio - 1.0) * float(np.median(context.variance[context.used]))
+    if name == "gain":
+        unit = "less" if ratio < 1.0 else "more"
+        sentence = f"{found}, and at the sources, too: one count is {unit} than one photon"
+        remedy = f"check [frame] gain: {1.0 / ratio:.3g} times the present one would cure it"
+    elif name == "read noise":
+        sentence = f"{found}, and at bright sources with less: some variance is constant"
+        known = getattr(context.posterior.noise, "shift", 0.0)
+        remedy = f"set [noise] read_noise to about {(variance + known) ** 0.5:.3g}"
+    elif name == "pedestal":
+        sentence = f"{found}, and at bright sources with more: {variance:.3g} counts are no photons"
+        remedy = f"check [frame] pedestal, {variance:.3g} counts more, or a smaller read_noise"
+    else:
+        sentence = f"{found}, and at bright sources with more: the noise is not the photons' alone"
+        remedy = "check the flat field and the variance of the noise model"
+    return Finding(Cause(name, 0.0, sentence, remedy), explained, "noise")

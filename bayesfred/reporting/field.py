@@ -1,0 +1,169 @@
+"""The figure of a displacement field: displacements, their errors, and what the sources say.
+
+It is a `matplotlib.figure.Figure` that belongs to no window and no pyplot state. Arrows and
+ellipses are enlarged by round factors, which the panels state, beside an arrow of known length.
+`bayesfred.analysis.field` and `bayesfred.analysis.sources` have the numbers.
+"""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from bayesfred._typing import Floats
+from bayesfred.analysis.field import DisplacementField
+from bayesfred.io.summary_table import Table
+from bayesfred.reporting.style import POSTERIOR_COLOUR, TRUTH_COLOUR
+
+__all__ = ["field_plot"]
+
+# light enough for black arrows
+SIZES = LinearSegmentedColormap.from_list("sizes", ["#ffffff", "#9ecae1", "#4292c6"])
+EXTRAPOLATED = "0.45"
+SIGNIFICANT = 3.0  # standard deviations
+WIDTH = 6.2  # inch
+
+Strings = NDArray[np.str_]
+
+
+def field_plot(field: DisplacementField, sources: Table, binning: int = 1) -> Figure:
+    """The displacement over the frame with its errors, and how far the sources are off the model.
+
+    Parameters
+    ----------
+    field : DisplacementField
+    sources : Table
+        Of `bayesfred.analysis.sources.source_table`, whose lengths are recorded pixels.
+    binning : int
+        Fine pixels along each side of a recorded pixel.
+
+    Returns
+    -------
+    Figure
+        One panel above the other, both in pixels of the fine grid.
+    """
+    u, v = field.points.u, field.points.v
+    ratio = min(max(float(np.ptp(v) / np.ptp(u)), 0.3), 1.6)
+    fig = Figure(figsize=(WIDTH, 2.2 + 2.0 * 0.8 * WIDTH * ratio), dpi=100, layout="constrained")
+    above, below = fig.subplots(2, 1)
+    unit = "px" if binning == 1 else "fine px"
+    for ax in (above, below):
+        ax.set(
+            xlim=(u.min(), u.max()), ylim=(v.min(), v.max()), aspect="equal",
+            xlabel=f"u / {unit}", ylabel=f"v / {unit}",
+        )  # fmt: skip
+    _displacements(fig, above, field, unit)
+    _residuals(below, field, sources, (binning, unit))
+    return fig
+
+
+def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -> None:
+    """Size of the displacement in colour, arrows, and ellipses of one standard deviation."""
+    points, mean = field.points, field.displacement
+    length = np.hypot(mean[..., 0], mean[..., 1])
+    image = ax.pcolormesh(
+        points.u, points.v, np.ma.masked_invalid(length), cmap=SIZES, vmin=0.0,
+        shading="gouraud" if np.isfinite(length).all() else "nearest", rasterized=True,
+    )  # fmt: skip
+    fig.colorbar(image, ax=ax, label=f"displacement / {unit}", shrink=0.8)
+    _hatch(ax, points.u, points.v, points.hull)
+    some = (slice(None, None, 2), slice(None, None, 2))
+    shown = np.isfinite(length[some])
+    at = np.stack([points.u[some][shown], points.v[some][shown]], axis=1)
+    spacing = 2.0 * _spacing(field)
+    arrows = _arrows(ax, at, mean[some][shown], 1.2 * spacing, unit)
+    values, vectors = np.linalg.eigh(field.covariance[some][shown])
+    axes = np.sqrt(np.maximum(values, 0.0))  # along the columns of `vectors`, the larger last
+    among = (points.weights[some] > 0.0)[shown]
+    enlarged = _round(0.4 * spacing / max(np.max(axes[among], initial=0.0), 1e-12))
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    size = 2.0 * enlarged * axes
+    for which, colour in ((among, TRUTH_COLOUR), (~among, EXTRAPOLATED)):
+        ax.add_collection(
+            EllipseCollection(
+                size[which, 1], size[which, 0], angle[which], units="xy", offsets=at[which],
+                offset_transform=ax.transData, facecolors="none", edgecolors=colour, linewidths=1.1,
+            )
+        )  # fmt: skip
+    ax.set_title(
+        f"displacement{arrows}\nellipses (1 sd) {_times(enlarged)}",
+        loc="left", fontsize=11,
+    )  # fmt: skip
+
+
+def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[int, str]) -> None:
+    """By how much the counts say that each source is off the place where the model has it."""
+    binning, unit = pixel
+    at, off, sd = (
+        binning * np.stack([np.asarray(sources[name], dtype=np.float64) for name in names], axis=1)
+        for names in (("u", "v"), ("du", "dv"), ("du_sd", "dv_sd"))
+    )
+    known = np.isfinite(at + off + sd).all(axis=1)
+    at, off, sd = at[known], off[known], sd[known]
+    ax.plot(at[:, 0], at[:, 1], ".", color="0.3", markersize=3)
+    far = np.hypot(*(off / sd).T) > SIGNIFICANT if len(at) else np.zeros(0, dtype=bool)
+    colours = np.where(far, TRUTH_COLOUR, POSTERIOR_COLOUR)
+    arrows = _arrows(ax, at, off, 3.0 * _spacing(field), unit, colours)
+    ax.set_title(
+        f"sources, off the model{arrows}\n{far.sum()} of {len(at)} by more than "
+        f"{SIGNIFICANT:.0f} standard deviations{', orange' if far.any() else ''}",
+        loc="left", fontsize=11,
+    )  # fmt: skip
+
+
+def _arrows(
+    ax: Axes, at: Floats, vectors: Floats, longest: float, unit: str, colours: Strings | str = "k"
+) -> str:
+    """Arrows of which the longest has this length on the axes, and one of known length below.
+
+    Returns how they are enlarged, for the title.
+    """
+    largest = float(np.max(np.hypot(*vectors.T), initial=0.0))
+    if largest == 0.0:
+        return ""
+    enlarged, key = _round(longest / largest), _round(largest)
+    arrows = ax.quiver(
+        *at.T, *(enlarged * vectors.T), angles="xy", scale_units="xy", scale=1.0, color=colours,
+        width=0.004, zorder=3,
+    )  # fmt: skip
+    left = 1.0 - enlarged * key / float(np.ptp(ax.get_xlim()))
+    ax.quiverkey(
+        arrows, left, -0.1, enlarged * key, f"{key:,.10g} {unit}", labelpos="W", color="k",
+        fontproperties={"size": 11},
+    )  # fmt: skip
+    return f": arrows {_times(enlarged)}"
+
+
+def _times(enlarged: float) -> str:
+    return "to scale" if enlarged == 1.0 else f"{enlarged:,.10g} times enlarged"
+
+
+def _hatch(ax: Axes, u: Floats, v: Floats, hull: Floats) -> None:
+    """Hatch the frame outside the hull of the sources' images."""
+    low_u, high_u, low_v, high_v = u.min(), u.max(), v.min(), v.max()
+    frame = [(low_u, low_v), (high_u, low_v), (high_u, high_v), (low_u, high_v)]
+    rings = [frame, hull[::-1].tolist()] if len(hull) else [frame]
+    paths = [Path([*ring, ring[0]], closed=True) for ring in rings]
+    patch = PathPatch(
+        Path.make_compound_path(*paths), facecolor="none", edgecolor=EXTRAPOLATED, hatch="///",
+        linewidth=0.8, alpha=0.5,
+    )  # fmt: skip
+    ax.add_patch(patch)
+
+
+def _spacing(field: DisplacementField) -> float:
+    """Distance of the grid's points along the frame's longer side, pixel."""
+    u, v = field.points.u, field.points.v
+    return float(max(u[0, 1] - u[0, 0], v[1, 0] - v[0, 0]))
+
+
+def _round(value: float) -> float:
+    """The largest of 1, 2, 5, 10, ... and their tenths, hundredths ... that is not larger."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return power * next(step for step in (5.0, 2.0, 1.0) if step * power <= value * (1.0 + 1e-9))

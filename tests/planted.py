@@ -1,0 +1,279 @@
+"""Frames in which one thing is wrong that the model does not know of, for the tests of causes.
+
+Every fault is planted into the same kind of frame: 48 sources of various fluxes in 161 x 161
+pixels, a Gaussian PSF of 1.8 pixels, a background of 20 counts, a cubic lens. Everything random
+follows from the seed.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF, MoffatPSF
+from bayesfred.model.noise import simulate
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
+
+Floats = NDArray[np.float64]
+
+SHAPE = (161, 161)
+HALF = 0.5 * (SHAPE[0] - 1)
+SIGMA = 1.8
+LEVEL = 20.0
+LENS = PolynomialDistortion([(3, 0, 0, 0), (1, 2, 0, 0)], [(2, 1, 0, 0), (0, 3, 0, 0)])
+THETA = np.full(4, 2.0 / HALF**3)  # moves a source at the frame's edge by 2 pixels
+
+
+def field(seed: int, n: int = 48) -> SourceCatalog:
+    """Sources that stand apart by 6 widths or more, within 70 pixels of the middle."""
+    rng = np.random.default_rng(seed)
+    kept: list[Floats] = []
+    while len(kept) < n:
+        new = rng.uniform(-70.0, 70.0, 2)
+        if all(np.hypot(*(new - old)) > 6.0 * SIGMA for old in kept):
+            kept.append(new)
+    x, y = np.array(kept).T
+    return SourceCatalog(x, y, 4e3 * rng.lognormal(0.0, 0.5, n))
+
+
+def camera(sources: SourceCatalog, **changes: Any) -> ForwardModel:
+    """The model of the frame."""
+    given = {"detector": Detector(SHAPE), "psf": GaussianPSF(SIGMA), "distortion": LENS}
+    return ForwardModel(sources=sources, **(given | changes))
+
+
+def counts(model: ForwardModel, seed: int, level: float = LEVEL) -> Floats:
+    theta = THETA if model.distortion is LENS else np.zeros(model.distortion.n_terms)
+    return simulate(model, theta, level, seed=seed + 10_000)
+
+
+def moved(s: SourceCatalog, x: Floats, y: Floats) -> SourceCatalog:
+    return SourceCatalog(x, y, s.flux)
+
+
+def true(seed: int, **nuisances: Any) -> Posterior:
+    """Nothing is wrong."""
+    model = camera(field(seed))
+    return Posterior(model, counts(model, seed), nuisances=Nuisances(**nuisances))
+
+
+def saturation(seed: int) -> Posterior:
+    """The brightest pixels hold the most that the detector can."""
+    model = camera(field(seed))
+    frame = counts(model, seed)
+    full = np.sort(model.sources.flux)[-12] / (2.0 * np.pi * SIGMA**2)
+    return Posterior(model, np.minimum(frame, np.round(full)))
+
+
+def gain(seed: int) -> Posterior:
+    """A frame in adu of 4 electrons is taken for counts."""
+    model = camera(field(seed))
+    frame = counts(model, seed) / 4.0
+    small = replace(model, sources=replace(model.sources, flux=model.sources.flux / 4.0))
+    return Posterior(small, frame)
+
+
+def gain_too_large(seed: int) -> Posterior:
+    """Counts that were multiplied by 3 are taken for counts."""
+    model = camera(field(seed))
+    frame = counts(model, seed) * 3.0
+    large = replace(model, sources=replace(model.sources, flux=model.sources.flux * 3.0))
+    return Posterior(large, frame)
+
+
+def read_noise(seed: int) -> Posterior:
+    """Nobody said that there is read noise of 8 counts."""
+    model = camera(field(seed))
+    frame = counts(model, seed, 40.0)
+    frame += np.random.default_rng(seed + 20_000).normal(0.0, 8.0, SHAPE)
+    return Posterior(model, np.maximum(frame, 0.0))
+
+
+def pedestal(seed: int) -> Posterior:
+    """A pedestal of 60 counts was not subtracted."""
+    model = camera(field(seed))
+    return Posterior(model, counts(model, seed) + 60.0)
+
+
+def over_dispersion(seed: int) -> Posterior:
+    """Every pixel's sensitivity is another, by 20 %."""
+    model = camera(field(seed))
+    rng = np.random.default_rng(seed + 20_000)
+    flat = rng.gamma(25.0, 1.0 / 25.0, SHAPE)
+    return Posterior(model, rng.poisson(flat * model.expected_counts(THETA, 100.0)).astype(float))
+
+
+def background(seed: int) -> Posterior:
+    """The background is twice as high on one side as on the other."""
+    model = camera(field(seed))
+    slope = LEVEL * (1.0 + np.linspace(-1 / 3, 1 / 3, SHAPE[1]))
+    rng = np.random.default_rng(seed + 20_000)
+    return Posterior(model, rng.poisson(model.expected_counts(THETA) + slope).astype(float))
+
+
+def origin(seed: int) -> Posterior:
+    """The catalogue counts pixels from the frame's corner."""
+    s = field(seed)
+    return Posterior(camera(moved(s, s.x + HALF, s.y + HALF)), counts(camera(s), seed))
+
+
+def parity(seed: int) -> Posterior:
+    """The catalogue's x runs the other way."""
+    s = field(seed)
+    return Posterior(camera(moved(s, -s.x, s.y)), counts(camera(s), seed))
+
+
+def shift(seed: int, by: float = 2.5) -> Posterior:
+    """The frame is shifted, and there is no offset to fit."""
+    s = field(seed)
+    return Posterior(camera(s), counts(camera(moved(s, s.x + by, s.y - 0.6 * by)), seed))
+
+
+def far_shift(seed: int) -> Posterior:
+    return shift(seed, 11.0)
+
+
+def rotation(seed: int, degrees: float = 3.0) -> Posterior:
+    """The camera is rotated about its axis, and there are no linear terms."""
+    s, angle = field(seed), np.deg2rad(degrees)
+    x, y = np.cos(angle) * s.x - np.sin(angle) * s.y, np.sin(angle) * s.x + np.cos(angle) * s.y
+    return Posterior(camera(s), counts(camera(moved(s, x, y)), seed))
+
+
+def far_rotation(seed: int) -> Posterior:
+    return rotation(seed, 25.0)
+
+
+def scale(seed: int) -> Posterior:
+    """The pixel scale is wrong by 4 %."""
+    s = field(seed)
+    return Posterior(camera(s), counts(camera(moved(s, 1.04 * s.x, 1.04 * s.y)), seed))
+
+
+def missing_terms(seed: int) -> Posterior:
+    """The lens is tilted, too: x^2 and x y."""
+    s = field(seed)
+    tilt = 2.5 / HALF**2
+    x, y = s.x + tilt * s.x**2, s.y + tilt * s.x * s.y
+    return Posterior(camera(s), counts(camera(moved(s, x, y)), seed))
+
+
+def far_missing_terms(seed: int) -> Posterior:
+    s = field(seed)
+    tilt = 12.0 / HALF**2
+    x, y = s.x + tilt * s.x**2, s.y + tilt * s.x * s.y
+    return Posterior(camera(s), counts(camera(moved(s, x, y)), seed))
+
+
+def unmatched(seed: int) -> Posterior:
+    """The catalogue is of another field; every flux is free."""
+    return Posterior(
+        camera(field(seed)),
+        counts(camera(field(seed + 30_000)), seed),
+        nuisances=Nuisances(flux="free"),
+    )
+
+
+def empty(seed: int) -> Posterior:
+    """The shutter was closed; every flux is free."""
+    noise = np.random.default_rng(seed + 20_000).poisson(LEVEL, SHAPE).astype(float)
+    return Posterior(camera(field(seed)), noise, nuisances=Nuisances(flux="free"))
+
+
+def wrong_sources(seed: int) -> Posterior:
+    """Four catalogue positions are wrong by 8 pixels."""
+    s, rng = field(seed), np.random.default_rng(seed + 20_000)
+    angle, few = rng.uniform(0.0, 2.0 * np.pi, 4), rng.choice(48, 4, replace=False)
+    x, y = s.x.copy(), s.y.copy()
+    x[few] += 8.0 * np.cos(angle)
+    y[few] += 8.0 * np.sin(angle)
+    return Posterior(camera(moved(s, x, y)), counts(camera(s), seed))
+
+
+def wrong_fluxes_of_few(seed: int) -> Posterior:
+    """Three sources vary: they are three times as bright as in the catalogue."""
+    s = field(seed)
+    flux = s.flux.copy()
+    flux[:3] *= 3.0
+    return Posterior(camera(s), counts(camera(replace(s, flux=flux)), seed))
+
+
+def uncatalogued(seed: int) -> Posterior:
+    """Ten sources are in no catalogue."""
+    s = field(seed, 58)
+    few = SourceCatalog(s.x[:48], s.y[:48], s.flux[:48])
+    return Posterior(camera(few), counts(camera(s), seed))
+
+
+def fluxes(seed: int) -> Posterior:
+    """Fluxes are taken to be exact, and are known to 40 %."""
+    s, rng = field(seed), np.random.default_rng(seed + 20_000)
+    true_flux = s.flux * rng.lognormal(0.0, 0.4, len(s))
+    return Posterior(camera(s), counts(camera(replace(s, flux=true_flux)), seed))
+
+
+def flux_scale(seed: int) -> Posterior:
+    """Fluxes are right but for a factor of 1.6."""
+    s = field(seed)
+    return Posterior(camera(s), counts(camera(replace(s, flux=1.6 * s.flux)), seed))
+
+
+def wide_psf(seed: int, **nuisances: Any) -> Posterior:
+    """The PSF is wider by a quarter."""
+    s = field(seed)
+    frame = counts(camera(s, psf=GaussianPSF(1.25 * SIGMA)), seed)
+    return Posterior(camera(s), frame, nuisances=Nuisances(**nuisances))
+
+
+def moffat_psf(seed: int) -> Posterior:
+    """The PSF has wings, and its Gaussian's width is fitted."""
+    s = field(seed)
+    frame = counts(camera(s, psf=MoffatPSF(2.355 * SIGMA, 2.2), tolerance=1e-5), seed)
+    return Posterior(camera(s), frame, nuisances=Nuisances(flux="free", psf_sigma=True))
+
+
+def undersampled(seed: int) -> Posterior:
+    """A narrow PSF whose pixels are taken for points where they integrate."""
+    s = field(seed)
+    frame = counts(camera(s, psf=GaussianPSF(0.6), detector=Detector(SHAPE, pixel="box")), seed)
+    return Posterior(
+        camera(s, psf=GaussianPSF(0.62)), frame, nuisances=Nuisances(flux="free", offset=True)
+    )
+
+
+# every fault, the names that are right for it, and what a run that fits well needs
+FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
+    "saturation": (saturation, ("saturation",)),
+    "gain": (gain, ("gain",)),
+    "gain, counts too large": (gain_too_large, ("gain",)),
+    "read noise": (read_noise, ("read noise",)),
+    "pedestal": (pedestal, ("pedestal",)),
+    "over-dispersion": (over_dispersion, ("over-dispersion",)),
+    "background": (background, ("background",)),
+    "origin": (origin, ("origin",)),
+    "parity": (parity, ("parity",)),
+    "shift": (shift, ("shift",)),
+    "shift by 11 pixels": (far_shift, ("shift",)),
+    "rotation": (rotation, ("rotation or scale",)),
+    "rotation by 25 degrees": (far_rotation, ("rotation or scale",)),
+    "scale": (scale, ("rotation or scale",)),
+    "missing terms": (missing_terms, ("missing terms",)),
+    "missing terms of 12 pixels": (far_missing_terms, ("missing terms",)),
+    "another field": (unmatched, ("unmatched",)),
+    "no light": (empty, ("unmatched",)),
+    "wrong positions of few": (wrong_sources, ("wrong sources",)),
+    "wrong fluxes of few": (wrong_fluxes_of_few, ("wrong sources",)),
+    "uncatalogued sources": (uncatalogued, ("uncatalogued sources",)),
+    "fluxes": (fluxes, ("fluxes",)),
+    "a factor of all fluxes": (flux_scale, ("fluxes",)),
+    "PSF too wide": (wide_psf, ("PSF",)),
+    "PSF with wings": (moffat_psf, ("PSF",)),
+    "pixels taken for points": (undersampled, ("PSF",)),
+}
