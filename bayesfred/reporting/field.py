@@ -132,10 +132,10 @@ def _arrows(
         *at.T, *(enlarged * vectors.T), angles="xy", scale_units="xy", scale=1.0, color=colours,
         width=0.004, zorder=3,
     )  # fmt: skip
-    left = 1.0 - enlarged * key / float(np.ptp(ax.get_xlim()))
+    width, height = (float(np.ptp(limits)) for limits in (ax.get_xlim(), ax.get_ylim()))
     ax.quiverkey(
-        arrows, left, -0.1, enlarged * key, f"{key:,.10g} {unit}", labelpos="W", color="k",
-        fontproperties={"size": 11},
+        arrows, 1.0 - enlarged * key / width, -0.1 * width / height, enlarged * key,
+        f"{key:,.10g} {unit}", labelpos="W", color="k", fontproperties={"size": 11},
     )  # fmt: skip
     return f": arrows {_times(enlarged)}"
 
