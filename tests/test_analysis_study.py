@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ from bayesfred.analysis import executor, sbc
 from bayesfred.analysis import noise_study as noise_levels
 from bayesfred.analysis.ecdf_bands import band, ecdf, points, uniformity
 from bayesfred.analysis.executor import Answer
+from bayesfred.analysis.field import field_points
+from bayesfred.analysis.photons import laplace_error
 from bayesfred.analysis.study_helpers import given, seeds
 from bayesfred.errors import InputError
 from bayesfred.io import tables
@@ -206,6 +208,16 @@ def test_a_frame_of_a_noise_study_is_an_ordinary_fit(tmp_path: Path) -> None:
     assert rows["theta.distance"][k] == pytest.approx(
         off @ np.linalg.inv(bound[:2, :2]) @ off, rel=1e-9
     )
+    # f = c u x and g = c v y: the object at x = u / (1 - c u) is imaged at u
+    points = field_points(template, np.array([*TRUTH, 50.0]))
+    off = [
+        p / (1.0 - estimate.params[j] * p) - p / (1.0 - TRUTH[j] * p)
+        for j, p in enumerate((points.u, points.v))
+    ]
+    squares = 0.5 * (off[0] ** 2 + off[1] ** 2)[points.inside]
+    assert rows["displacement.error"][k] == pytest.approx(np.sqrt(squares.mean()), rel=1e-6)
+    predicted = laplace_error(posterior, np.array([*TRUTH, 50.0]), points)
+    assert rows["displacement.predicted"][k] == pytest.approx(predicted, rel=1e-9)
     sources = model.expected_counts(TRUTH)
     estimated = model.expected_counts(estimate.params[:2])
     assert rows["lambda"][k] == pytest.approx(np.mean(counts - estimated), rel=1e-9)
@@ -237,6 +249,22 @@ def test_cells_are_sums_over_frames(tmp_path: Path) -> None:
     assert cells["coverage_68"][at] == covered.mean()
     assert rows["background.truth"][mine].tolist() == [100.0] * 6  # exposure is a factor
     assert cells["lambda"][at] == pytest.approx(100.0, abs=4 * cells["lambda_error"][at])
+    assert np.isnan(cells["displacement_rms"][at]) and np.isnan(cells["photons"][at])
+    at -= 2  # all of theta
+    squares = rows["displacement.error"][mine] ** 2
+    root = np.sqrt(squares.mean())
+    assert cells["displacement_rms"][at] == pytest.approx(root)
+    error = squares.std(ddof=1) / np.sqrt(6) / (2.0 * root)
+    assert cells["displacement_rms_error"][at] == pytest.approx(error)
+    predicted = np.sqrt(np.mean(rows["displacement.predicted"][mine] ** 2))
+    assert cells["displacement_predicted"][at] == pytest.approx(predicted)
+    # the flux at which the error is 0.01 px, over the same background
+    at_that = replace(tiny(), sources=bf.SourceCatalog.grid(2, 14.0, cells["photons"][at]))
+    posterior = bf.Posterior(at_that, at_that.expected_counts(TRUTH, 100.0))
+    truth = np.array([*TRUTH, 100.0])
+    found = laplace_error(posterior, truth, field_points(posterior, truth))
+    assert found == pytest.approx(0.01, rel=0.01)
+    assert "for an error of 0.01 px rms: sources of" in study.message
 
 
 def test_draws_agree_with_laplace(tmp_path: Path) -> None:
@@ -264,6 +292,7 @@ def test_draws_agree_with_laplace(tmp_path: Path) -> None:
         ({"sources": [1.5]}, "sources"),
         ({"flux": [-1.0]}, "flux"),
         ({"exposure": [float("nan")]}, "exposure"),
+        ({"error": 0.0}, "error"),
         ({"psf_sigma": [0.2]}, "psf"),
         ({"flux": [1.0] * 101, "exposure": [1.0] * 100}, "combinations"),
         ({"nuisances": bf.Nuisances("free", position_scatter=True)}, "position_scatter"),
@@ -830,6 +859,13 @@ def attains_the_bound(cells: dict[str, NDArray[Any]]) -> bool:
     return bool(0.9 < every < 1.1 and np.all(np.abs(one - 1.0) < 4.0 * error))
 
 
+def as_predicted(cells: dict[str, NDArray[Any]]) -> bool:
+    """Whether the displacement's error is the predicted one at every level, within 4 of its own."""
+    whole = cells["parameter"] == "theta"
+    off = cells["displacement_rms"][whole] - cells["displacement_predicted"][whole]
+    return bool(np.all(np.abs(off) < 4.0 * cells["displacement_rms_error"][whole]))
+
+
 @pytest.mark.statistics
 def test_the_papers_noise_study_attains_the_bound(tmp_path: Path) -> None:
     study = paper_levels(tmp_path / "n.ecsv")
@@ -845,3 +881,6 @@ def test_the_papers_noise_study_attains_the_bound(tmp_path: Path) -> None:
     # estimates that scatter by a tenth more do not
     worse = {key: study.cells[key] / 1.1**2 for key in ("efficiency", "efficiency_error")}
     assert not attains_the_bound(study.cells | worse)
+    assert as_predicted(study.cells)
+    worse = {"displacement_rms": 1.2 * study.cells["displacement_rms"]}
+    assert not as_predicted(study.cells | worse)

@@ -424,6 +424,14 @@ def test_demo(tmp_path: Path) -> None:
     assert (
         verdict.prior_dominated == () and "prior-dominated" not in output.stdout
     )  # the default priors are weak
+    displaced, photons, last = output.stdout.splitlines()[-3:]
+    assert re.match(
+        r"Displacement: rms \d\.\d+ px, up to \d+\.\d px at \(u, v\) = \(-?\d+, -?\d+\); known to "
+        r"0\.00\d+ px rms, 0\.0\d+ px at worst",
+        displaced,
+    )
+    assert re.match(r"For an error of 0\.001 px rms: sources of \d,\d\d0,000 photons", photons)
+    assert last == verdict.message
 
     # the settings on its page describe the same frame, model and run
     (tmp_path / "run.toml").write_text(settings_on(folder / "demo.html"))

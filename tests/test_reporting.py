@@ -10,21 +10,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.quiver import Quiver
 from numpy.typing import NDArray
 from scipy.stats import norm
 
 from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.analysis.field import displacement_field
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.io.summary_table import make_table
 from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
+from bayesfred.reporting.field import field_plot
 from bayesfred.reporting.figures import described_residual, page_figures
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
 from bayesfred.reporting.html import write_report
@@ -439,6 +444,78 @@ def test_intervals_are_quantiles_of_the_draws(tmp_path: Path) -> None:
 
 
 # --- figures --------------------------------------------------------------------------------------
+
+
+def field_of(detector: Detector, scale: float, n: int = 25) -> tuple[Any, Any]:
+    """A field that is scaled, and sources each of which is off by (0.2, -0.1) recorded pixels."""
+    distortion = PolynomialDistortion(((1, 0, 0, 0),), ((0, 1, 0, 0),))
+    sources = SourceCatalog.grid(round(n**0.5), 12.0, 1e3)
+    model = ForwardModel(detector, sources, GaussianPSF(2.5), distortion)
+    posterior = Posterior(model, model.expected_counts([scale, scale], 1.0))
+    drawn = np.random.default_rng(1).normal([scale, scale, 1.0], 1e-3, (50, 3))
+    chain: Any = SimpleNamespace(
+        posterior=lambda: posterior, draws=lambda: drawn,
+        estimate=SimpleNamespace(params=np.array([scale, scale, 1.0])),
+    )  # fmt: skip
+    u, v = (p * (1.0 - scale) / detector.binning for p in (sources.x, sources.y))
+    ones = np.ones(len(sources))
+    columns = {"u": u, "v": v, "du": 0.2 * ones, "dv": -0.1 * ones, "du_sd": ones, "dv_sd": ones}
+    return displacement_field(chain), make_table(columns)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_displacements_are_shown_at_the_stated_scale(binning: int) -> None:
+    field, sources = field_of(Detector((61, 81), binning=binning), 0.02)
+    above, below, _ = field_plot(field, sources, binning).axes
+    unit = "px" if binning == 1 else "fine px"
+    assert above.get_xlabel() == f"u / {unit}"
+    arrows = next(c for c in above.collections if isinstance(c, Quiver))
+    ellipses = [c for c in above.collections if isinstance(c, EllipseCollection)]
+    assert arrows.N == 11 * 9 == sum(len(c.get_widths()) for c in ellipses)
+    enlarged = {
+        word: float(re.search(rf"{word}.* ([\d,]+) times enlarged", title)[1].replace(",", ""))  # type: ignore[index]
+        for title, words in (
+            (above.get_title("left"), ("arrows", "ellipses")), (below.get_title("left"), ("off",)),
+        )
+        for word in words
+    }  # fmt: skip
+    grid = np.stack([field.points.u, field.points.v], axis=-1)[::2, ::2].reshape(-1, 2)
+    shown = field.displacement[::2, ::2].reshape(-1, 2)
+    assert pytest.approx(grid) == arrows.XY
+    assert np.stack([arrows.U, arrows.V], axis=1) == pytest.approx(enlarged["arrows"] * shown)
+    # half of each axis is one standard deviation, enlarged; those of the hull come first
+    values = np.linalg.eigvalsh(field.covariance[::2, ::2].reshape(-1, 2, 2))
+    inside = field.points.inside[::2, ::2].ravel()
+    for some, c in zip((inside, ~inside), ellipses, strict=True):
+        widths = 2.0 * enlarged["ellipses"] * np.sqrt(np.maximum(values[some], 0.0))
+        assert c.get_widths() == pytest.approx(widths[:, 1])
+        assert c.get_heights() == pytest.approx(widths[:, 0])
+    arrows = next(c for c in below.collections if isinstance(c, Quiver))
+    assert binning * 0.2 * enlarged["off"] == pytest.approx(arrows.U[0])
+    assert "0 of 25 by more than 3" in below.get_title("left")
+    assert np.array_equal(arrows.XY[:, 0], binning * np.asarray(sources["u"]))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 200), (150, 10)])
+@pytest.mark.parametrize("scale", [0.0, 0.02, 1.0])
+def test_any_field_is_shown(shape: tuple[int, int], scale: float) -> None:
+    """Nothing displaced, nothing imaged (a scale of 1), one source, frames that are lines."""
+    field, sources = field_of(Detector(shape), scale, 1)
+    for known in (sources, sources[:0]):
+        assert pixels(field_plot(field, known)).std() > 0.02
+    sources["du"][0] = np.nan
+    assert pixels(field_plot(field, sources)).std() > 0.02
+
+
+def test_page_begins_with_the_displacement(tmp_path: Path) -> None:
+    field, _ = field_of(Detector((61, 81)), 0.02)
+    chain, posterior = run()
+    posterior.likelihood = Posterior(posterior.model, posterior.counts).likelihood
+    figures = page_figures(fitted(posterior, chain.estimate.params), chain, field=field)
+    assert figures[0].heading == "Displacement" and len(figures) == 5
+    _, page = report(tmp_path, chain=chain, figures=figures, result=field.message)
+    verdict, rest = page.text.split("Parameters")[0], page.text.split("Parameters")[1]
+    assert field.message in verdict and field.message not in rest
 
 
 def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:

@@ -128,14 +128,17 @@ def _arrows(
     if largest == 0.0:
         return ""
     enlarged, key = _round(longest / largest), _round(largest)
-    arrows = ax.quiver(
+    ax.quiver(
         *at.T, *(enlarged * vectors.T), angles="xy", scale_units="xy", scale=1.0, color=colours,
         width=0.004, zorder=3,
     )  # fmt: skip
-    left = 1.0 - enlarged * key / float(np.ptp(ax.get_xlim()))
-    ax.quiverkey(
-        arrows, left, -0.1, enlarged * key, f"{key:,.10g} {unit}", labelpos="W", color="k",
-        fontproperties={"size": 11},
+    left, right = ax.get_xlim()
+    below = -0.1 * (right - left) / float(np.ptp(ax.get_ylim()))
+    ax.annotate(
+        f"{key:,.10g} {unit} ", (right, below), (right - enlarged * key, below),
+        xycoords=ax.get_xaxis_transform(), ha="right", va="center", fontsize=11,
+        arrowprops={"arrowstyle": "-|>", "facecolor": "k", "shrinkA": 0, "shrinkB": 0},
+        annotation_clip=False,
     )  # fmt: skip
     return f": arrows {_times(enlarged)}"
 

@@ -118,7 +118,7 @@ class Chain:
 
         Notes
         -----
-        At most 1,000 draws are used, evenly spaced; see
+        At most 1,000 draws are used, spread over the chain; see
         `bayesfred.sampling.displacement.displacement`.
 
         Examples
