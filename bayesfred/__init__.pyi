@@ -1,4 +1,5 @@
 from . import commands, show
+from .analysis.causes import Cause, find_causes
 from .analysis.comparison import Comparison, compare
 from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.noise_study import NoiseStudy, noise_study
@@ -23,6 +24,7 @@ from .sampling.sampler import sample
 
 __all__ = [
     "BackgroundNoise",
+    "Cause",
     "Chain",
     "Comparison",
     "Detector",
@@ -48,6 +50,7 @@ __all__ = [
     "compare",
     "correct_sampling",
     "diagnose",
+    "find_causes",
     "find_map",
     "laplace",
     "noise_study",

@@ -30,7 +30,6 @@ from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.laplace import laplace
 from bayesfred.sampling.sampler import sample, searching
-from bayesfred.sampling.summary import summary
 
 __all__ = [
     "Job",
@@ -320,7 +319,7 @@ def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_es
     """
     posterior, truth = chain.posterior(), job.truth if job else None
     diagnostics = diagnose(chain, target_ess=target_ess)
-    table = summary(chain, truth=truth, columns=diagnostics.columns)
+    table = diagnostics.summary(chain, truth=truth)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
     page, picture = beside(path)
     write_report(
