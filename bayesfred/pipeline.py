@@ -36,7 +36,6 @@ from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.laplace import laplace
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import sample, searching
-from bayesfred.sampling.summary import summary
 from bayesfred.sections import toml
 
 __all__ = [
@@ -375,7 +374,7 @@ def write_results(
     shown = corner_parameters(chain.draws(), chain.parameter_names, corner)
     diagnostics = diagnose(chain, target_ess=target_ess)
     field = displacement_field(chain)
-    table = summary(chain, truth=truth, columns=diagnostics.columns)
+    table = diagnostics.summary(chain, truth=truth)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
     page, picture, sources = outputs.beside(page)
     write_report(

@@ -6,14 +6,14 @@ E. B. Wilson, M. M. Hilferty (1931), PNAS 17, 684: a normal deviate from a chi-s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from bayesfred.io.summary_table import Table, make_table
 
-__all__ = ["Check", "check_table", "deviate", "not_tested"]
+__all__ = ["Check", "check_table", "deviate", "not_tested", "sums"]
 
 
 class Check(NamedTuple):
@@ -52,3 +52,17 @@ def deviate(chi2: float, dof: int) -> float:
     """The normal deviate that is exceeded about as rarely as this chi-square."""
     part = 2.0 / (9.0 * dof)
     return float(((chi2 / dof) ** (1.0 / 3.0) - 1.0 + part) / math.sqrt(part))
+
+
+def sums(fit: Mapping[str, float]) -> list[Check]:
+    """Pearson's statistic and the deviance, from `fit_statistics`."""
+    meanings = {
+        "Pearson": "sum of squared residuals in standard deviations",
+        "deviance": "twice the log-likelihood that a perfect model would gain",
+    }
+    checks = []
+    for name, meaning in meanings.items():
+        value, expected, sd = (fit[f"{name.lower()}{part}"] for part in ("", "_expected", "_sd"))
+        z = (value - expected) / sd if sd > 0.0 else math.nan
+        checks.append(Check(name, value, expected, sd, z, meaning))
+    return checks
