@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesfred import build, settings
 from bayesfred._typing import Floats
+from bayesfred.analysis.comparison import Comparison
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
@@ -36,6 +37,7 @@ from bayesfred.sampling.summary import summary
 from bayesfred.sections import toml
 
 __all__ = [
+    "Compared",
     "Job",
     "Result",
     "Say",
@@ -136,6 +138,25 @@ class Verification:
     def holds(self) -> bool:
         """Whether everything holds."""
         return all(check.holds for check in self.checks)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Runs side by side.
+
+    Attributes
+    ----------
+    ranking : Comparison or None
+        How well their models predict; None where they cannot be ranked.
+    reason : str
+        Why they cannot.
+    page : Path or None
+        The page, where one was asked for.
+    """
+
+    ranking: Comparison | None
+    reason: str
+    page: Path | None
 
 
 @dataclass(frozen=True, eq=False)
