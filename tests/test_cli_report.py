@@ -102,14 +102,19 @@ def test_settings_of_a_resumed_run_have_the_seed_of_its_beginning(
     np.testing.assert_array_equal(before.chain, after.chain)
 
 
-def test_report_keeps_settings_notes_and_date(finished: Path, tmp_path: Path) -> None:
+def test_report_keeps_settings_notes_and_date_and_shows_the_pairs_asked_for(
+    finished: Path, tmp_path: Path
+) -> None:
     shutil.copy(finished / "chains" / "run.h5", tmp_path)
-    assert invoke(tmp_path, "report", "run.h5")[0] == 3
+    assert invoke(tmp_path, "report", "run.h5", "--corner", "background, g_vy")[0] == 3
     before, after = finished / "chains" / "run.html", tmp_path / "run.html"
     assert settings_on(after) == settings_on(before)
     assert "stars.csv: 4 sources" in text_on(after)
     made = re.compile(r"frame\.fits, 45 × 60 pixels.*\d{4}-\d\d-\d\d \d\d:\d\d UTC")
     assert made.findall(text_on(after)) == made.findall(text_on(before)) != []
+    assert "2 of 3 parameters" in text_on(after)
+    assert "Posterior: other parameters" in text_on(after)
+    assert "Posterior: other parameters" not in text_on(before)
 
 
 def test_report_replaces_nothing_unasked(finished: Path, tmp_path: Path) -> None:
@@ -145,13 +150,6 @@ def test_report_refuses_in_one_line(
     assert code == 2 and said.count("\n") == 1
     assert all(word in said for word in words)
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
-
-
-def test_report_shows_the_parameters_that_are_asked_for(finished: Path, tmp_path: Path) -> None:
-    shutil.copy(finished / "chains" / "run.h5", tmp_path)
-    assert invoke(tmp_path, "report", "run.h5", "--corner", "background, g_vy")[0] == 3
-    page = (tmp_path / "run.html").read_text(encoding="utf-8")
-    assert "2 of 3 parameters" in page and "Posterior: other parameters" in page
 
 
 def test_page_shows_truth_again(finished: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ fail on a page that was spoilt.
 
 import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -39,8 +40,7 @@ LARGEST = 2_000_000  # bytes
 SETTINGS = "\n".join(f'[section_{k}]\nkey = "{"a long value " * 12}"' for k in range(9))
 
 
-def found_with_causes(chain: Any) -> Any:
-    found = diagnose(chain)
+def found_with_causes(found: Any) -> Any:
     values = {name: getattr(found, name) for name in ("columns", *found.__dataclass_fields__)}
     cause = SimpleNamespace(
         sentence="The images are wider than the PSF.", remedy="Fit it: psf_sigma = true."
@@ -48,30 +48,37 @@ def found_with_causes(chain: Any) -> Any:
     return SimpleNamespace(**{**values, "trustworthy": False}, causes=(cause, cause))
 
 
-def page(folder: Path, kind: str) -> Path:
-    """A green page with a truth, a red one with causes, one of thirty parameters, a comparison."""
-    chain, posterior = run(tuple(f"nuisance_{k}" for k in range(25 if kind == "thirty" else 0)))
+@cache
+def contents(d: int) -> tuple[Any, Any, Any, Any]:
+    """A chain of d parameters, its diagnostics, its truth and its figures, by which pages differ."""
+    chain, posterior = run(tuple(f"nuisance_{k}" for k in range(d - 5)))
     posterior.parameters = described(*chain.parameter_names)
     notes = ("A note. " * 40, "path/" * 60)
     chain.record = RunRecord("Night 3", "a_frame_of_a_long_name.fits", SETTINGS, notes)
-    fitted = FittedFrame.at(posterior, chain.estimate.params)
-    diagnostics, shown, truth = diagnose(chain), range(len(chain.parameter_names)), None
-    if kind == "green":
+    fitted, truth = FittedFrame.at(posterior, chain.estimate.params), None
+    if d == 5:
         truth = np.append(TRUTH, BACKGROUND)
-    elif kind == "red":
-        diagnostics = found_with_causes(chain)
-    elif kind == "thirty":  # a frame that compresses badly: high, and all noise
+    else:  # a frame that compresses badly: high, and all noise
         noise = np.random.default_rng(1).poisson(50.0, (1200, 600)).astype(float)
         level = np.full(noise.shape, 50.0)
-        fitted, shown = FittedFrame(noise, level, level**0.5, noise >= 0.0), range(12)
-    figures = page_figures(fitted, chain, diagnostics, shown=list(shown), truth=truth)
+        fitted = FittedFrame(noise, level, level**0.5, noise >= 0.0)
+    diagnostics = diagnose(chain)
+    figures = page_figures(fitted, chain, diagnostics, shown=range(min(d, 12)), truth=truth)
+    return chain, diagnostics, truth, figures
+
+
+def page(folder: Path, kind: str) -> Path:
+    """A green page with a truth, a red one with causes, one of thirty parameters, a comparison."""
     folder.mkdir()
+    chain, diagnostics, truth, figures = contents(30 if kind == "thirty" else 5)
     if kind == "compared":
-        found = diagnostics, found_with_causes(chain)
+        found = diagnostics, found_with_causes(diagnostics)
         runs = [ComparedRun(f"chains/{k}.h5", chain, d) for k, d in enumerate(found)]
         scores = [Score(run.name, 5, -9e4, 31.4, 5.0, 6.0, 2.0, 0.3, 0) for run in runs]
         ranking = Comparison(tuple(scores), runs[0].name)
         return write_comparison(folder / "report.html", runs, ranking)
+    if kind == "red":
+        diagnostics = found_with_causes(diagnostics)
     sentence = "Images are displaced by up to 1.234 ± 0.012 pixels."
     report(
         folder, chain=chain, diagnostics=diagnostics, figures=figures, truth=truth, result=sentence
@@ -126,8 +133,7 @@ class Tab:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_page_is_accessible_silent_and_as_wide_as_the_screen(
     kind: str, width: int, scheme: str, pages: dict[str, Path], browser: Any
 ) -> None:
