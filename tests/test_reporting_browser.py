@@ -50,7 +50,7 @@ def found_with_causes(found: Any) -> Any:
 
 @cache
 def contents(d: int) -> tuple[Any, Any, Any, Any]:
-    """A chain of d parameters, its diagnostics, its truth and its figures, by which pages differ."""
+    """A chain of d parameters, its diagnostics, truth and figures: by these pages differ."""
     chain, posterior = run(tuple(f"nuisance_{k}" for k in range(d - 5)))
     posterior.parameters = described(*chain.parameter_names)
     notes = ("A note. " * 40, "path/" * 60)
