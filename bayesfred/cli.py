@@ -167,9 +167,20 @@ def compare(
         list[Path],
         typer.Argument(metavar="A.h5 B.h5 ...", help="Chains of one frame.", show_default=False),
     ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="PAGE.html", help="Show the runs side by side.", show_default="no page"
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Rank models of one frame by how well they predict every pixel from the others."""
-    _run(lambda: bf.show.show_comparison(bf.commands.compare(chain_files)))
+    _run(
+        lambda: bf.show.show_comparison(
+            bf.commands.compare(chain_files, out=out, overwrite=overwrite)
+        )
+    )
 
 
 @app.command()

@@ -15,6 +15,7 @@ from bayesfred import build, pipeline, settings
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
+from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.photons import photons_needed
@@ -24,7 +25,8 @@ from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.io.tables import TableRecord, write_table
-from bayesfred.pipeline import Result, Say, Simulated, Study, Verification
+from bayesfred.pipeline import Compared, Result, Say, Simulated, Study, Verification
+from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
@@ -336,22 +338,29 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:
     return Verification(tuple(checks), tuple(others))
 
 
-def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
-    """Rank models of one frame by leave-one-out predictive accuracy.
+def compare(
+    chain_files: Sequence[PathLike], *, out: PathLike | None = None, overwrite: bool = False
+) -> Compared:
+    """Rank models of one frame by leave-one-out predictive accuracy, and show runs side by side.
 
     Parameters
     ----------
     chain_files : sequence of path-like
         At least two.
+    out : path-like, optional
+        A page to write, .html. It is written of runs that cannot be ranked, too.
+    overwrite : bool
+        Replace the page.
 
     Returns
     -------
-    Comparison
+    Compared
 
     Raises
     ------
     InputError
-        If a chain cannot be read, is named twice, or the models cannot be compared.
+        If a chain cannot be read, is named twice, the page exists, or without a page the models
+        cannot be compared.
     """
     names = [Path(file) for file in chain_files]
     for name in names:
@@ -359,7 +368,24 @@ def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
             raise InputError(
                 f"{name}: got it twice, expected chains of different models: name each once"
             )
-    return comparison.compare({str(name): open_chain(name) for name in names})
+    page = None if out is None else Path(out)
+    if page:
+        outputs.may_write_page(page, inputs=names, overwrite=overwrite)
+    chains = {str(name): open_chain(name) for name in names}
+    ranking, reason = None, ""
+    try:
+        ranking = comparison.compare(chains)
+    except InputError as error:
+        if page is None or len(chains) < 2:
+            raise
+        reason = str(error)
+    if page:
+        runs = [
+            ComparedRun(name, chain, diagnose(chain, target_ess=chain.target_ess))
+            for name, chain in chains.items()
+        ]
+        write_comparison(page, runs, ranking, reason)
+    return Compared(ranking, reason, page)
 
 
 def crosscheck(run_file: PathLike, *, say: Say | None = None) -> cross_check.CrossCheck:

@@ -14,6 +14,7 @@ import numpy as np
 from bayesfred import build, settings
 from bayesfred._typing import Floats
 from bayesfred.analysis.choose_terms import choose_terms
+from bayesfred.analysis.comparison import Comparison
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.field import DisplacementField, displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
@@ -39,6 +40,7 @@ from bayesfred.sampling.sampler import sample, searching
 from bayesfred.sections import toml
 
 __all__ = [
+    "Compared",
     "Job",
     "Result",
     "Say",
@@ -153,6 +155,25 @@ class Verification:
     def holds(self) -> bool:
         """Whether everything holds."""
         return all(check.holds for check in self.checks)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Runs side by side.
+
+    Attributes
+    ----------
+    ranking : Comparison or None
+        How well their models predict; None where they cannot be ranked.
+    reason : str
+        Why they cannot.
+    page : Path or None
+        The page, where one was asked for.
+    """
+
+    ranking: Comparison | None
+    reason: str
+    page: Path | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from bayesfred.analysis import comparison
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.errors import printable
-from bayesfred.pipeline import Result, Simulated, Study, Verification
+from bayesfred.pipeline import Compared, Result, Simulated, Study, Verification
 from bayesfred.reporting import screen
 
 
@@ -68,16 +67,23 @@ def show_verification(found: Verification) -> bool:
     return found.holds
 
 
-def show_comparison(compared: comparison.Comparison) -> bool:
-    """Print the ranking of models."""
-    _print(screen.comparison_table(compared))
+def show_comparison(compared: Compared) -> bool:
+    """Print the ranking of models, or why there is none."""
+    ranking = compared.ranking
+    if ranking is not None:
+        _print(screen.comparison_table(ranking))
+    if compared.page:
+        _print_files(page=compared.page)
+    if ranking is None:
+        print(f"not ranked: {compared.reason}")
+        return False
     print(
-        f"chosen: {printable(compared.chosen)}, the one with the fewest parameters that predicts "
+        f"chosen: {printable(ranking.chosen)}, the one with the fewest parameters that predicts "
         "as well as the best"
     )
-    if not compared.reliable:
+    if not ranking.reliable:
         print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
-    return compared.reliable
+    return ranking.reliable
 
 
 def show_cross_check(found: CrossCheck, *, as_json: bool = False) -> bool:
