@@ -29,7 +29,8 @@ from bayesfred.reporting.posteriors import overview
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.laplace import laplace
-from bayesfred.sampling.sampler import sample, searching
+from bayesfred.sampling.progress import searching
+from bayesfred.sampling.sampler import sample
 from bayesfred.sampling.summary import summary
 
 __all__ = [

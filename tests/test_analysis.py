@@ -240,6 +240,7 @@ def chain_at(params: Floats, posterior: Any, **changes: Any) -> Any:
         "log_prob": np.zeros(draws.shape[:3]),
         "accepted": np.full((4, 32), 12),
         "burn_in": 3,
+        "method": "mcmc",
         "estimate": estimate,
         "posterior": lambda: posterior,
     }

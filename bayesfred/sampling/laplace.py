@@ -34,7 +34,8 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import write_chain
 from bayesfred.sampling.moves import LaplaceMove
-from bayesfred.sampling.sampler import check_estimate, check_output, searching, versions
+from bayesfred.sampling.progress import searching
+from bayesfred.sampling.sampler import check_estimate, check_output, versions
 
 __all__ = ["importance_efficiency", "laplace"]
 
@@ -69,7 +70,7 @@ def laplace(
     overwrite : bool
         Replace the file.
     progress : bool
-        Say on standard error that the maximum is being searched for.
+        Say in a terminal that the maximum is being searched for.
 
     Returns
     -------
