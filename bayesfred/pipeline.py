@@ -35,8 +35,9 @@ from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.laplace import laplace
+from bayesfred.sampling.progress import searching
 from bayesfred.sampling.record import RunRecord
-from bayesfred.sampling.sampler import sample, searching
+from bayesfred.sampling.sampler import sample
 from bayesfred.sections import toml
 
 __all__ = [

@@ -90,6 +90,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "accepted": np.full((4, 32), 10),
         "burn_in": 2,
         "seed": 7,
+        "method": "mcmc",
         "estimate": estimate,
         "versions": {"numpy": "2.0", "bayesfred": "0.1"},
         "draws": lambda: chain[:, 2:].reshape(-1, len(names)),
@@ -347,7 +348,7 @@ def test_screen_page_and_summary_show_the_same_numbers(tmp_path: Path) -> None:
 
     _, page = report(tmp_path, truth=truth, chain=chain, diagnostics=diagnostics)
     body = page.text.replace("−", "-")
-    rows = zip(table, shown(parameter_table(table)), strict=True)
+    rows = zip(table, shown(parameter_table(table, 200)), strict=True)
     for values, (name, true, estimate, posterior, z, corner, rhat, ess, prior) in rows:
         assert name == values["name"]
         mean, _, sd, *power = posterior.split()
