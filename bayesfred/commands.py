@@ -21,14 +21,12 @@ from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
-from bayesfred.io import atomic, outputs, paths
+from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
-from bayesfred.io.tables import TableRecord, write_table
-from bayesfred.pipeline import Compared, Result, Say, Simulated, Study, Verification
+from bayesfred.pipeline import Say
+from bayesfred.records import Compared, Result, Simulated, Study, Verification
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
-from bayesfred.reporting.studies import calibration_plot, noise_plot
-from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
@@ -108,16 +106,15 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
-    if run.simulation is None:
-        raise _no_simulation(run_file)
+    simulation = build.simulation(run, run_file)
     if run.frame.gain is not None or run.frame.pedestal != 0.0:
         raise InputError(
             f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts "
             "are written: remove them"
         )
-    posterior, truth = build.simulated(run, run_file, run.simulation.seed)
+    posterior, truth = build.simulated(run, run_file, simulation.seed)
     # written beside the run file, whatever lies in the data folder
-    folder, grid = run_file.parent, run.simulation.grid is not None
+    folder, grid = run_file.parent, simulation.grid is not None
     frame = paths.within(folder, run.frame.path, f"{run_file}: frame.path")
     catalogue = paths.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
     paths.may_write(frame, overwrite=overwrite, beside=(catalogue,) if grid else ())
@@ -227,10 +224,10 @@ def study(
     kind = kind or s.kind
     given = s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv")
     table = paths.within(".", given, f"{run_file}: study.path")
-    findings, picture = table.with_name(f"{table.stem}.summary.ecsv"), table.with_suffix(".png")
-    paths.may_write(table, overwrite=overwrite, resume=resume, beside=(findings, picture))
-    if simulation is None and kind == "noise":
-        raise _no_simulation(run_file)
+    others = outputs.beside_study(table)
+    paths.may_write(table, overwrite=overwrite, resume=resume, beside=others)
+    if kind == "noise":
+        build.simulation(run, run_file)
     truth: Floats | None = None
     if simulation is None:
         posterior, _, _ = pipeline.read_frame(run, run_file, say)
@@ -256,14 +253,7 @@ def study(
             )  # fmt: skip
         else:
             result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)
-    if isinstance(result, NoiseStudy):
-        found, figure = result.cells, noise_plot(result, posterior.parameters)
-    else:
-        found, figure = result.quantities, calibration_plot(result, posterior.parameters)
-    record = TableRecord(found, {"study": kind, "message": result.message})
-    write_table(findings, record, overwrite=True)
-    atomic.replace(picture, png(figure))
-    return Study(result, table, findings, picture)
+    return pipeline.write_study(result, posterior, table)
 
 
 def report(
@@ -410,10 +400,3 @@ def crosscheck(run_file: PathLike, *, say: Say | None = None) -> cross_check.Cro
     posterior, estimate, _ = pipeline.read_frame(settings.read_settings(run_file), run_file, say)
     with pipeline.naming(run_file):
         return cross_check.cross_check(posterior, estimate=estimate)
-
-
-def _no_simulation(run_file: Path) -> InputError:
-    return InputError(
-        f"{run_file}: simulation: no such section, expected shape, theta and background: see "
-        "bayesfred fit --help"
-    )

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.errors import printable
-from bayesfred.pipeline import Compared, Result, Simulated, Study, Verification
+from bayesfred.records import Compared, Result, Simulated, Study, Verification
 from bayesfred.reporting import screen
 
 
