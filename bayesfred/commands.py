@@ -30,7 +30,6 @@ from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
-_SEEDED = ("sampling", "simulation")
 DEMO_ERROR = 0.001  # pixel
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
@@ -76,7 +75,10 @@ def demo(
     outputs.make_folder(output)
     example = Path(__file__).with_name("example.toml")
     run = settings.read_settings(example)
-    seeded = {key: getattr(run, key).model_copy(update={"seed": seed}) for key in _SEEDED}
+    seeded = {
+        key: getattr(run, key).model_copy(update={"seed": seed})
+        for key in ("sampling", "simulation")
+    }
     run = run.model_copy(update={**seeded, "study": None})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
