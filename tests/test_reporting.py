@@ -277,6 +277,8 @@ def test_page_without_truth_or_notes(tmp_path: Path) -> None:
     assert "truth" not in page.text.split("Parameters")[1]
     assert "Notes" not in page.text and "Settings" not in page.text
     assert "report: frame, 61 × 81 pixels" in page.text and "UTC" not in page.text
+    chain.record = RunRecord()  # of a caller who gave nothing
+    assert "report: frame, 61 × 81 pixels" in report(tmp_path, chain=chain)[1].text
 
 
 def test_page_of_a_badly_sampled_chain_says_why(tmp_path: Path) -> None:

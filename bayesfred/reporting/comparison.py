@@ -50,7 +50,7 @@ class ComparedRun:
         made = f"{made_text(record)}, " if chain.record else ""
         return {
             "name": self.name,
-            "title": record.title,
+            "title": record.title or Path(self.name).stem,
             "model": described_model(record, chain.posterior()),
             "made": f"{made}bayesfred {chain.versions['bayesfred']}",
             "diagnostics": self.diagnostics,

@@ -104,7 +104,7 @@ def write_report(
     made = "bayesfred " + chain.versions["bayesfred"]
     if chain.record:
         made = f"{made_text(record)}, {made}"
-    heading, subtitle = record.title, described_model(record, posterior)
+    heading, subtitle = record.title or path.stem, described_model(record, posterior)
     page = render(
         "run.html",
         title=f"{heading}: {subtitle}; {made}",
