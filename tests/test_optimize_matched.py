@@ -60,7 +60,7 @@ def test_nothing_but_noise_matches_nothing() -> None:
 def test_faint_sources_of_known_flux_count_together() -> None:
     """One by one they are lost in the noise, 48 of them are not; without their light they are."""
     s = planted.field(4)
-    faint = planted.camera(replace(s, flux=np.full(48, 100.0)))
+    faint = planted.camera(replace(s, flux=np.full(48, 40.0)))
     for model, enough in (
         (faint, True),
         (replace(faint, sources=replace(s, flux=s.flux * 1e-9)), False),
