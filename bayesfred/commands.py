@@ -74,12 +74,7 @@ def demo(
     output = Path(folder, "demo.h5")
     outputs.make_folder(output)
     example = Path(__file__).with_name("example.toml")
-    run = settings.read_settings(example)
-    seeded = {
-        key: getattr(run, key).model_copy(update={"seed": seed})
-        for key in ("sampling", "simulation")
-    }
-    run = run.model_copy(update={**seeded, "study": None})
+    run = settings.read_settings(example).seeded(seed)
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
     result = pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
