@@ -252,9 +252,10 @@ def _field_figure(field: DisplacementField, chain: Chain, posterior: Posterior) 
         "Displacement",
         "Above: from the object to its image, with the error that the posterior gives it. What is "
         "hatched lies beyond the sources, where only the terms of the distortion say what happens; "
-        "its ellipses are grey. Below: by how much the counts of each source say that its image is "
-        "off the place where the model has it; arrows that agree with their neighbours mean a "
-        "missing term.",
+        "its ellipses are grey, and left out where they are large. Below: by how much the counts "
+        "of each source say that its image is off the place where the model has it; arrows that "
+        "agree with their neighbours mean a missing term. The longest arrows are left out; a cross "
+        "stands for one of more than 3 standard deviations.",
         field_plot(field, sources, posterior.model.detector.binning),
     )
 
