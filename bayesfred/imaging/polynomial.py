@@ -354,9 +354,10 @@ class Polynomial:
 
         Parameters
         ----------
-        theta, offset
-            As for `image_position`.
+        theta : array_like, shape (n_terms,), pixel^(1 - degree)
         u, v : ndarray, shape (points,), pixel
+        offset : array_like, shape (2,), pixel
+            As for `image_position`.
 
         Returns
         -------
