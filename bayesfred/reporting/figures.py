@@ -80,9 +80,10 @@ def page_figures(
             "Displacement",
             "Above: from the object to its image, with the error that the posterior gives it. What "
             "is hatched lies beyond the sources, where only the terms of the distortion say what "
-            "happens; its ellipses are grey. Below: by how much the counts of each source say that "
-            "its image is off the place where the model has it; arrows that agree with their "
-            "neighbours mean a missing term.",
+            "happens; its ellipses are grey, and left out where they are large. Below: by how much "
+            "the counts of each source say that its image is off the place where the model has it; "
+            "arrows that agree with their neighbours mean a missing term. The longest arrows are "
+            "left out; a cross stands for one of more than 3 standard deviations.",
             field.message,
             field_plot(field, diagnostics.sources, posterior.model.detector.binning),
         ),
