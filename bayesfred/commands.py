@@ -24,7 +24,7 @@ from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.io.tables import TableRecord, write_table
-from bayesfred.pipeline import Result, Say, Simulated, Study, Verification
+from bayesfred.pipeline import Result, Say, Simulated, Study
 from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
@@ -308,7 +308,7 @@ def report(
     return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
 
 
-def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:
+def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Verification:
     """Compute again what a chain file holds.
 
     Parameters
@@ -333,7 +333,7 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:
         for name, here in versions().items()
         if made.get(name) != here
     )
-    return Verification(tuple(checks), tuple(others))
+    return verification.Verification(tuple(checks), tuple(others))
 
 
 def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:

@@ -19,7 +19,6 @@ from bayesfred.analysis.field import DisplacementField, displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import PosteriorCalibration
-from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
 from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.io.summary_table import Table
@@ -45,7 +44,6 @@ __all__ = [
     "Say",
     "Simulated",
     "Study",
-    "Verification",
     "fit_frame",
     "naming",
     "read_frame",
@@ -134,26 +132,6 @@ class Study:
         if isinstance(self.result, PosteriorCalibration):
             return self.result.calibrated
         return not self.result.cells["failed"].any()
-
-
-@dataclass(frozen=True)
-class Verification:
-    """What could be computed again of a chain file.
-
-    Attributes
-    ----------
-    checks : tuple of Check
-    other_versions : tuple of str
-        Packages that were of another version when the chain was made.
-    """
-
-    checks: tuple[Check, ...]
-    other_versions: tuple[str, ...]
-
-    @property
-    def holds(self) -> bool:
-        """Whether everything holds."""
-        return all(check.holds for check in self.checks)
 
 
 @dataclass(frozen=True, eq=False)

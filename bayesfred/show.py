@@ -12,8 +12,9 @@ from rich.table import Table
 
 from bayesfred.analysis import comparison
 from bayesfred.analysis.cross_check import CrossCheck
+from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
-from bayesfred.pipeline import Result, Simulated, Study, Verification
+from bayesfred.pipeline import Result, Simulated, Study
 from bayesfred.reporting import screen
 
 
