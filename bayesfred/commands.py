@@ -25,7 +25,7 @@ from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.pipeline import Say
-from bayesfred.records import Compared, Result, Simulated, Study, Verification
+from bayesfred.records import Compared, Result, Simulated, Study
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
@@ -297,7 +297,7 @@ def report(
     return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
 
 
-def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:
+def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Verification:
     """Compute again what a chain file holds.
 
     Parameters
@@ -322,7 +322,7 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:
         for name, here in versions().items()
         if made.get(name) != here
     )
-    return Verification(tuple(checks), tuple(others))
+    return verification.Verification(tuple(checks), tuple(others))
 
 
 def compare(

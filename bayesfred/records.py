@@ -10,12 +10,11 @@ from bayesfred.analysis.field import DisplacementField
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import PosteriorCalibration
-from bayesfred.analysis.verify import Check
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
 
-__all__ = ["Compared", "Result", "Simulated", "Study", "Verification"]
+__all__ = ["Compared", "Result", "Simulated", "Study"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,26 +89,6 @@ class Study:
         if isinstance(self.result, PosteriorCalibration):
             return self.result.calibrated
         return not self.result.cells["failed"].any()
-
-
-@dataclass(frozen=True)
-class Verification:
-    """What could be computed again of a chain file.
-
-    Attributes
-    ----------
-    checks : tuple of Check
-    other_versions : tuple of str
-        Packages that were of another version when the chain was made.
-    """
-
-    checks: tuple[Check, ...]
-    other_versions: tuple[str, ...]
-
-    @property
-    def holds(self) -> bool:
-        """Whether everything holds."""
-        return all(check.holds for check in self.checks)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from typing import Any
 from rich.console import Console
 
 from bayesfred.analysis.cross_check import CrossCheck
+from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
-from bayesfred.records import Compared, Result, Simulated, Study, Verification
+from bayesfred.records import Compared, Result, Simulated, Study
 from bayesfred.reporting import screen
 
 

@@ -4,6 +4,7 @@ On the machine and with the packages that made a run, everything agrees bit for 
 differently in the last digits, so a check allows for that much, and reports the difference.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,6 +39,26 @@ class Check(NamedTuple):
     what: str
     finding: str
     holds: bool
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What could be computed again of a chain file.
+
+    Attributes
+    ----------
+    checks : tuple of Check
+    other_versions : tuple of str
+        Packages that were of another version when the chain was made.
+    """
+
+    checks: tuple[Check, ...]
+    other_versions: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything holds."""
+        return all(check.holds for check in self.checks)
 
 
 def verify(path: Path, *, every_draw: bool = False) -> list[Check]:

@@ -263,9 +263,8 @@ def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats,
     model = posterior.model
     params = dict(zip(chain.parameter_names, chain.estimate.params, strict=True))
     theta = chain.estimate.params[: model.distortion.n_terms]
-    x = model.sources.x + params.get("offset_x", 0.0)
-    y = model.sources.y + params.get("offset_y", 0.0)
-    u, v = model.distortion.image_position(theta, x, y)
+    offset = params.get("offset_x", 0.0), params.get("offset_y", 0.0)
+    u, v = model.polynomial.image_position(theta, model.sources.x, model.sources.y, offset=offset)
     binning = model.detector.binning
     half_width = max(4, math.ceil(3.5 * params.get("psf_sigma", model.psf.sigma) / binning))
     return u / binning, v / binning, half_width
