@@ -32,7 +32,7 @@ __all__ = [
 
 # Light where there is little: a page in dark mode inverts its figures, see `template.html`.
 COUNTS_MAP, RESIDUAL_MAP = "gray_r", "RdBu_r"
-MASKED = "#a9d18e"  # a colour that neither map has
+MASKED = "#cfe3bf"  # a colour that neither map has
 RESIDUAL_LIMIT = 5.0
 TRIPTYCH_MARGIN, TRIPTYCH_SIDE = 0.7, 5.6
 MAX_STARS = 24
