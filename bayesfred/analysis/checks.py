@@ -2,6 +2,7 @@
 
 References
 ----------
+E. Paulson (1942), Annals of Mathematical Statistics 13, 233: a normal deviate from a ratio F.
 E. B. Wilson, M. M. Hilferty (1931), PNAS 17, 684: a normal deviate from a chi-square.
 """
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from bayesfred.io.summary_table import Table, make_table
 
-__all__ = ["Check", "check_table", "deviate", "not_tested", "sums"]
+__all__ = ["Check", "check_table", "deviate", "deviate_of_ratio", "not_tested", "sums"]
 
 
 class Check(NamedTuple):
@@ -33,12 +34,12 @@ class Check(NamedTuple):
 
 def check_table(checks: Sequence[Check]) -> Table:
     """A table with a row for each check."""
-    rows = list(zip(*checks, strict=True))
     texts = {"name", "meaning"}
+    columns = {name: [getattr(check, name) for check in checks] for name in Check._fields}
     return make_table(
         {
-            name: list(column) if name in texts else np.array(column, dtype=np.float64)
-            for name, column in zip(Check._fields, rows, strict=True)
+            name: column if name in texts else np.array(column, dtype=np.float64)
+            for name, column in columns.items()
         }
     )
 
@@ -46,6 +47,12 @@ def check_table(checks: Sequence[Check]) -> Table:
 def not_tested(name: str, why: str) -> Check:
     """The row of what could not be tested."""
     return Check(name, math.nan, math.nan, math.nan, math.nan, f"not tested: {why}")
+
+
+def deviate_of_ratio(f: float, dof: int, left: float) -> float:
+    """The normal deviate that is exceeded about as rarely as this F of dof and left degrees."""
+    one, other, root = 2.0 / (9.0 * dof), 2.0 / (9.0 * left), f ** (1.0 / 3.0)
+    return float(((1.0 - other) * root - 1.0 + one) / math.sqrt(other * root**2 + one))
 
 
 def deviate(chi2: float, dof: int) -> float:
