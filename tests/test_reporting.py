@@ -89,6 +89,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "log_prob": np.zeros(chain.shape[:3]),
         "accepted": np.full((4, 32), 10),
         "burn_in": 2,
+        "method": "mcmc",
         "seed": 7,
         "method": "mcmc",
         "estimate": estimate,
