@@ -414,7 +414,7 @@ def check(files: Files, drawn: bool) -> None:
         else:
             assert result.exit_code in (0, 3)
             assert re.fullmatch(r"(sampling [^\n]*\n)?", result.stderr)
-            assert {Path(path).suffix for path in visible} == {".h5", ".html", ".png"}
+            assert {Path(path).suffix for path in visible} == {".h5", ".html", ".png", ".ecsv"}
             assert all(c.isprintable() for line in result.stdout.splitlines() for c in line)
             chain = open_chain(next(root / path for path in visible if path.endswith(".h5")))
             assert np.isfinite(chain.chain).all()

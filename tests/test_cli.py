@@ -39,6 +39,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.io import catalogues, frames
 from bayesfred.io.hdf5_checks import seal
+from bayesfred.io.tables import read_table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
 from bayesfred.pipeline import read_frame
@@ -169,7 +170,8 @@ def test_fit_leaves_a_chain_a_page_and_a_picture(finished: tuple[Path, Output]) 
     assert output.code == 0
     assert "Traceback" not in output.stderr
     visible = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-    assert visible == {"run.toml", "frame.fits", "stars.csv", "run.h5", "run.html", "run.png"}
+    left = {"run.h5", "run.html", "run.png", "run.sources.ecsv"}
+    assert visible == {"run.toml", "frame.fits", "stars.csv", *left}
     for word in (
         "parameter",
         "MAP",
@@ -180,6 +182,7 @@ def test_fit_leaves_a_chain_a_page_and_a_picture(finished: tuple[Path, Output]) 
         "run.h5",
         "run.html",
         "run.png",
+        "run.sources.ecsv",
     ):
         assert word in output.stdout
     rows = [
@@ -187,6 +190,15 @@ def test_fit_leaves_a_chain_a_page_and_a_picture(finished: tuple[Path, Output]) 
     ]
     assert [next(name for name in NAMES if f" {name} " in row) for row in rows] == list(NAMES)
     check_verdict(folder, output, trustworthy=True)
+
+
+def test_the_table_of_sources_is_that_of_the_diagnostics(finished: tuple[Path, Output]) -> None:
+    chain = open_chain(finished[0] / "run.h5")
+    table = read_table(finished[0] / "run.sources.ecsv")
+    expected = diagnose(chain).sources
+    assert list(table.columns) == expected.colnames
+    for name in expected.colnames:
+        assert np.array_equal(table.columns[name], expected[name], equal_nan=True)
 
 
 def check_verdict(folder: Path, output: Output, *, trustworthy: bool) -> None:
@@ -286,6 +298,7 @@ def test_report_rebuilds_page_and_picture(finished: tuple[Path, Output], tmp_pat
         "run.h5",
         "run.html",
         "run.png",
+        "run.sources.ecsv",
     ]  # a reader takes no lock
 
 
@@ -400,6 +413,7 @@ def test_demo(tmp_path: Path) -> None:
         "demo.h5",
         "demo.html",
         "demo.png",
+        "demo.sources.ecsv",
     }
     check_page_and_picture(folder, "demo")
     chain = open_chain(folder / "demo.h5")
@@ -679,6 +693,11 @@ REFUSALS = [
     ),
     Refusal("page exists", content("run.html", "precious"), ("run.html", "exists", "--overwrite")),
     Refusal("picture exists", content("run.png", "precious"), ("run.png", "exists", "--overwrite")),
+    Refusal(
+        "table of sources exists",
+        content("run.sources.ecsv", "precious"),
+        ("run.sources.ecsv", "exists", "--overwrite"),
+    ),
     Refusal(
         "output is a folder",
         lambda folder: (folder / "run.h5").mkdir(),
@@ -1056,7 +1075,9 @@ def test_no_chain_through_a_linked_default_folder(folder: Path, tmp_path: Path) 
     check_refusal(Refusal("", unchanged, ("run.toml", "output.path", "leads out of")), folder)
 
 
-@pytest.mark.parametrize("name", ["run.h5", "run.html", "run.png", ".run.h5.lock"])
+@pytest.mark.parametrize(
+    "name", ["run.h5", "run.html", "run.png", "run.sources.ecsv", ".run.h5.lock"]
+)
 @pytest.mark.parametrize("target", ["precious", "absent"])
 @pytest.mark.parametrize("option", ["", "--overwrite", "--resume"])
 def test_links_are_not_written_through(name: str, target: str, option: str, folder: Path) -> None:
@@ -1075,12 +1096,12 @@ def test_report_replaces_links_and_leaves_their_targets(
     finished: tuple[Path, Output], tmp_path: Path
 ) -> None:
     shutil.copy(finished[0] / "run.h5", tmp_path)
-    for name in ("run.html", "run.png"):
+    for name in ("run.html", "run.png", "run.sources.ecsv"):
         (tmp_path / f"precious {name}").write_text("precious")
         (tmp_path / name).symlink_to(f"precious {name}")
     assert_refused(invoke(tmp_path, "report", "run.h5"), "run.html", "exists", "--overwrite")
     assert invoke(tmp_path, "report", "run.h5", "--overwrite").code in (0, 3)
-    for name in ("run.html", "run.png"):
+    for name in ("run.html", "run.png", "run.sources.ecsv"):
         assert (tmp_path / f"precious {name}").read_text() == "precious"
         assert not (tmp_path / name).is_symlink()
 
@@ -1359,7 +1380,7 @@ def test_default_output_is_in_chains_here_and_named_after_the_run_file(
     (folder / "night.toml").write_text(text, encoding="utf-8")
     assert invoke(away, "fit", folder / "night.toml").code == 3
     made = {path.name for path in (away / "chains").iterdir() if not path.name.startswith(".")}
-    assert made == {"night.h5", "night.html", "night.png"}
+    assert made == {"night.h5", "night.html", "night.png", "night.sources.ecsv"}
 
 
 def test_simulate_leaves_the_data_folder_alone(simulated: Path, tmp_path: Path) -> None:
