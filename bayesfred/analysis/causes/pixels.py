@@ -16,6 +16,9 @@ TILE = 16  # pixels a side of the squares in which the noise is measured
 FEWEST_QUIET = 24  # of a tile's pixels, or it does not count
 FEWEST_TILES = 5
 NOTICEABLE = 5.0  # standard deviations
+STEEPEST = (
+    30.0  # times the background's, to which noise in proportion to the counts is extrapolated
+)
 
 
 def full_pixels(context: Context) -> tuple[Flags, float]:
@@ -80,12 +83,21 @@ def background_and_noise(context: Context) -> Iterator[Finding]:
     order = np.argsort(scatter)
     kept = order[mean.size // 10 : mean.size - mean.size // 10]
     ratio = float(np.average(scatter[kept], weights=size[kept]))
-    ratio = max(ratio, 1e-9)
+    ratio = max(ratio / _level(context), 1e-9)
     everywhere = context.used.sum() / max(size.sum(), 1)
     yield from _background(context, (mean, size, place), ratio, float(everywhere))
     sd = (2.0 / size[kept].sum()) ** 0.5 * _tail(context)
     if abs(ratio - 1.0) > NOTICEABLE * max(sd, 1e-9) + 0.02:
         yield _noise(context, ratio)
+
+
+def _level(context: Context) -> float:
+    """Counts over expected counts of the quiet pixels: a wrong level is no wrong noise."""
+    noise = context.posterior.noise
+    if not isinstance(noise, PoissonNoise):
+        return 1.0
+    mu = float(np.mean(context.expected[context.quiet])) + noise.shift
+    return max((mu + float(np.mean(context.residual[context.quiet]))) / max(mu, 1e-9), 0.1)
 
 
 def _tail(context: Context) -> float:
@@ -156,7 +168,7 @@ def _noise(context: Context, ratio: float) -> Finding:
     names = ["gain", "read noise" if ratio > 1.0 else "pedestal"]
     growth = [np.ones(1), b / np.maximum(mu, 1e-9)]
     if ratio > 1.0:
-        names, growth = [*names, "over-dispersion"], [*growth, mu / b]
+        names, growth = [*names, "over-dispersion"], [*growth, np.minimum(mu / b, STEEPEST)]
     if not matched.any():
         return _finding_of_noise(context, names[0], ratio, growth[0])
     fainter = matched & (power <= np.median(power[matched]))

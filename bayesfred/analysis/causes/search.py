@@ -22,7 +22,8 @@ FEWEST = 6  # sources that have to be found
 MORE = 1.2  # times as many votes as the catalogue as it is, or it stays as it is
 ANGLES, SCALES = np.arange(0.0, 360.0, 4.0), np.geomspace(0.8, 1.25, 7)
 CUBIC_FROM = 16  # pairs
-TURNS = 8
+TURNS = 12
+WIDER = 1.5  # times the tolerance of the votes, for the first matches
 
 
 class Placement(NamedTuple):
@@ -67,7 +68,7 @@ def find_placement(context: Context) -> Placement | None:
             other = np.array([[c, -s * parity], [s, c * parity]])
             best = _better(best, (votes.count(other), other))
     (_, shift), found = best
-    return _refine(context, peaks, catalogue, (found, shift, votes.tolerance))
+    return _refine(context, peaks, catalogue, (found, shift, WIDER * votes.tolerance))
 
 
 def _better(
@@ -120,9 +121,9 @@ def _refine(
         pairs = np.stack([close[first], nearest[close[first]]])
         if pairs.shape[1] < FEWEST:
             return None
-        degree = 3 if turn > 2 and pairs.shape[1] >= CUBIC_FROM else 1
+        degree = 3 if turn > 1 and pairs.shape[1] >= CUBIC_FROM else 1
         predicted, affine = _polynomial(catalogue, pairs, peaks, degree)
-        tolerance = max(least, 0.7 * tolerance)
+        tolerance = max(least, 0.85 * tolerance)
     area = float(np.prod(np.ptp(peaks, axis=0))) + 1.0
     half = 0.5 * np.array(context.expected.shape[::-1])
     seen = (np.abs(predicted) < half).all(axis=1)
