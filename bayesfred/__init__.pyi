@@ -1,4 +1,5 @@
 from . import commands, show
+from .analysis.causes import Cause, find_causes
 from .analysis.choose_terms import TermChoice, choose_terms
 from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
@@ -28,6 +29,7 @@ from .sampling.sampler import sample
 
 __all__ = [
     "BackgroundNoise",
+    "Cause",
     "Chain",
     "Comparison",
     "CrossCheck",
@@ -61,6 +63,7 @@ __all__ = [
     "cross_check",
     "diagnose",
     "displacement_field",
+    "find_causes",
     "find_map",
     "laplace",
     "noise_study",

@@ -105,10 +105,19 @@ def posterior_given(
     )
 
 
+def simulation(run: settings.RunSettings, run_file: Path) -> settings.SimulationSettings:
+    """The section that describes a frame to simulate; an InputError where there is none."""
+    if run.simulation is None:
+        raise InputError(
+            f"{run_file}: simulation: no such section, expected shape, theta and background: see "
+            "bayesfred fit --help"
+        )
+    return run.simulation
+
+
 def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Posterior, Floats]:
     """A simulated frame's posterior and the true parameters."""
-    s = run.simulation
-    assert s is not None, "checked by the callers"
+    s = simulation(run, run_file)
     require_memory(f"{run_file}: simulation.shape", s.shape)
     psf = reference_psf(run, run_file)
     if s.grid:

@@ -5,8 +5,11 @@ sampled well, or the model does not fit the counts, or a check does not hold; 13
 terminated with everything saved.
 """
 
+import io
 import signal
+import sys
 from enum import StrEnum
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -36,6 +39,9 @@ Out = Annotated[
     Path | None,
     typer.Option("--out", metavar="PAGE.html", help="The page.", show_default="beside the chain"),
 ]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object; everything else to standard error.")
+]
 MapOnly = Annotated[
     bool,
     typer.Option("--map-only", help="Do not sample: maximum, and errors from the information."),
@@ -59,11 +65,15 @@ def demo(
     ] = 1,
     map_only: MapOnly = False,
     overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 terms, Poisson counts."""
     _run(
         lambda: bf.show.show_run(
-            bf.commands.demo(folder, seed=seed, map_only=map_only, overwrite=overwrite, say=print)
+            bf.commands.demo(
+                folder, seed=seed, map_only=map_only, overwrite=overwrite, say=_say(as_json)
+            ),
+            as_json=as_json,
         )
     )
 
@@ -76,14 +86,19 @@ def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
 
 @app.command(epilog="A complete run file:\n\n" + _example())
 def fit(
-    run_file: Run, map_only: MapOnly = False, resume: Resume = False, overwrite: Overwrite = False
+    run_file: Run,
+    map_only: MapOnly = False,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
     _run(
         lambda: bf.show.show_run(
             bf.commands.fit(
-                run_file, map_only=map_only, resume=resume, overwrite=overwrite, say=print
-            )
+                run_file, map_only=map_only, resume=resume, overwrite=overwrite, say=_say(as_json)
+            ),
+            as_json=as_json,
         )
     )
 
@@ -149,6 +164,7 @@ def report(
     ] = "",
     out: Out = None,
     overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """Judge a chain file again and write its report, .html and .png."""
     names = [name.strip() for name in corner.split(",") if name.strip()]
@@ -156,7 +172,8 @@ def report(
         lambda: bf.show.show_run(
             bf.commands.report(
                 chain_file, target_ess=target_ess, corner=names, out=out, overwrite=overwrite
-            )
+            ),
+            as_json=as_json,
         )
     )
 
@@ -167,9 +184,20 @@ def compare(
         list[Path],
         typer.Argument(metavar="A.h5 B.h5 ...", help="Chains of one frame.", show_default=False),
     ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="PAGE.html", help="Show the runs side by side.", show_default="no page"
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Rank models of one frame by how well they predict every pixel from the others."""
-    _run(lambda: bf.show.show_comparison(bf.commands.compare(chain_files)))
+    _run(
+        lambda: bf.show.show_comparison(
+            bf.commands.compare(chain_files, out=out, overwrite=overwrite)
+        )
+    )
 
 
 @app.command()
@@ -196,8 +224,16 @@ def verify(
     _run(lambda: bf.show.show_verification(bf.commands.verify(chain_file, every_draw=every_draw)))
 
 
+def _say(as_json: bool) -> "Callable[[str], None]":
+    """Where lines go that are told while a command works."""
+    return partial(typer.echo, err=True) if as_json else print
+
+
 def _run(work: "Callable[[], bool]") -> None:
     """Do a command's work, which says whether all is well, and turn the outcome into exit codes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters of a path
+            stream.reconfigure(errors="backslashreplace")
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # to end as after a Ctrl-C
     try:
         well = work()

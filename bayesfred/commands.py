@@ -15,22 +15,21 @@ from bayesfred import build, pipeline, settings
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
+from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
-from bayesfred.io import atomic, outputs, paths
+from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
-from bayesfred.io.tables import TableRecord, write_table
-from bayesfred.pipeline import Result, Say, Simulated, Study
-from bayesfred.reporting.studies import calibration_plot, noise_plot
-from bayesfred.reporting.style import png
+from bayesfred.pipeline import Say
+from bayesfred.records import Compared, Result, Simulated, Study
+from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
-_SEEDED = ("sampling", "simulation")
 DEMO_ERROR = 0.001  # pixel
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
@@ -75,9 +74,7 @@ def demo(
     output = Path(folder, "demo.h5")
     outputs.make_folder(output)
     example = Path(__file__).with_name("example.toml")
-    run = settings.read_settings(example)
-    seeded = {key: getattr(run, key).model_copy(update={"seed": seed}) for key in _SEEDED}
-    run = run.model_copy(update={**seeded, "study": None})
+    run = settings.read_settings(example).seeded(seed)
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
     result = pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
@@ -106,16 +103,15 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     """
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
-    if run.simulation is None:
-        raise _no_simulation(run_file)
+    simulation = build.simulation(run, run_file)
     if run.frame.gain is not None or run.frame.pedestal != 0.0:
         raise InputError(
             f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts "
             "are written: remove them"
         )
-    posterior, truth = build.simulated(run, run_file, run.simulation.seed)
+    posterior, truth = build.simulated(run, run_file, simulation.seed)
     # written beside the run file, whatever lies in the data folder
-    folder, grid = run_file.parent, run.simulation.grid is not None
+    folder, grid = run_file.parent, simulation.grid is not None
     frame = paths.within(folder, run.frame.path, f"{run_file}: frame.path")
     catalogue = paths.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
     paths.may_write(frame, overwrite=overwrite, beside=(catalogue,) if grid else ())
@@ -225,10 +221,10 @@ def study(
     kind = kind or s.kind
     given = s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv")
     table = paths.within(".", given, f"{run_file}: study.path")
-    findings, picture = table.with_name(f"{table.stem}.summary.ecsv"), table.with_suffix(".png")
-    paths.may_write(table, overwrite=overwrite, resume=resume, beside=(findings, picture))
-    if simulation is None and kind == "noise":
-        raise _no_simulation(run_file)
+    others = outputs.beside_study(table)
+    paths.may_write(table, overwrite=overwrite, resume=resume, beside=others)
+    if kind == "noise":
+        build.simulation(run, run_file)
     truth: Floats | None = None
     if simulation is None:
         posterior, _, _ = pipeline.read_frame(run, run_file, say)
@@ -254,14 +250,7 @@ def study(
             )  # fmt: skip
         else:
             result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)
-    if isinstance(result, NoiseStudy):
-        found, figure = result.cells, noise_plot(result, posterior.parameters)
-    else:
-        found, figure = result.quantities, calibration_plot(result, posterior.parameters)
-    record = TableRecord(found, {"study": kind, "message": result.message})
-    write_table(findings, record, overwrite=True)
-    atomic.replace(picture, png(figure))
-    return Study(result, table, findings, picture)
+    return pipeline.write_study(result, posterior, table)
 
 
 def report(
@@ -336,22 +325,29 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Ve
     return verification.Verification(tuple(checks), tuple(others))
 
 
-def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
-    """Rank models of one frame by leave-one-out predictive accuracy.
+def compare(
+    chain_files: Sequence[PathLike], *, out: PathLike | None = None, overwrite: bool = False
+) -> Compared:
+    """Rank models of one frame by leave-one-out predictive accuracy, and show runs side by side.
 
     Parameters
     ----------
     chain_files : sequence of path-like
         At least two.
+    out : path-like, optional
+        A page to write, .html. It is written of runs that cannot be ranked, too.
+    overwrite : bool
+        Replace the page.
 
     Returns
     -------
-    Comparison
+    Compared
 
     Raises
     ------
     InputError
-        If a chain cannot be read, is named twice, or the models cannot be compared.
+        If a chain cannot be read, is named twice, the page exists, or without a page the models
+        cannot be compared.
     """
     names = [Path(file) for file in chain_files]
     for name in names:
@@ -359,7 +355,24 @@ def compare(chain_files: Sequence[PathLike]) -> comparison.Comparison:
             raise InputError(
                 f"{name}: got it twice, expected chains of different models: name each once"
             )
-    return comparison.compare({str(name): open_chain(name) for name in names})
+    page = None if out is None else Path(out)
+    if page:
+        outputs.may_write_page(page, inputs=names, overwrite=overwrite)
+    chains = {str(name): open_chain(name) for name in names}
+    ranking, reason = None, ""
+    try:
+        ranking = comparison.compare(chains)
+    except InputError as error:
+        if page is None or len(chains) < 2:
+            raise
+        reason = str(error)
+    if page:
+        runs = [
+            ComparedRun(name, chain, diagnose(chain, target_ess=chain.target_ess))
+            for name, chain in chains.items()
+        ]
+        write_comparison(page, runs, ranking, reason)
+    return Compared(ranking, reason, page)
 
 
 def crosscheck(run_file: PathLike, *, say: Say | None = None) -> cross_check.CrossCheck:
@@ -384,10 +397,3 @@ def crosscheck(run_file: PathLike, *, say: Say | None = None) -> cross_check.Cro
     posterior, estimate, _ = pipeline.read_frame(settings.read_settings(run_file), run_file, say)
     with pipeline.naming(run_file):
         return cross_check.cross_check(posterior, estimate=estimate)
-
-
-def _no_simulation(run_file: Path) -> InputError:
-    return InputError(
-        f"{run_file}: simulation: no such section, expected shape, theta and background: see "
-        "bayesfred fit --help"
-    )

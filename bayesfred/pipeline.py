@@ -1,4 +1,4 @@
-"""The steps that commands share (read a frame, fit it, report), and the records they return.
+"""The steps that commands share: read a frame, fit it, report.
 
 Nothing is printed. What should be known while a step works goes to `say`, one line at a time.
 """
@@ -14,40 +14,38 @@ import numpy as np
 from bayesfred import build, settings
 from bayesfred._typing import Floats
 from bayesfred.analysis.choose_terms import choose_terms
-from bayesfred.analysis.diagnostics import Diagnostics, diagnose
-from bayesfred.analysis.field import DisplacementField, displacement_field
+from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.analysis.field import displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
-from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.errors import InputError, printable
 from bayesfred.io import atomic, frames, outputs, paths, tables
-from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import reject_outliers
+from bayesfred.records import Result, Study
 from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.reporting.html import write_report
 from bayesfred.reporting.posteriors import corner_parameters, overview
+from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.laplace import laplace
+from bayesfred.sampling.progress import searching
 from bayesfred.sampling.record import RunRecord
-from bayesfred.sampling.sampler import sample, searching
-from bayesfred.sampling.summary import summary
+from bayesfred.sampling.sampler import sample
 from bayesfred.sections import toml
 
 __all__ = [
     "Job",
-    "Result",
     "Say",
-    "Simulated",
-    "Study",
     "fit_frame",
     "naming",
     "read_frame",
     "write_results",
+    "write_study",
 ]
 
 Say = Callable[[str], None]
@@ -58,80 +56,6 @@ SOURCES_META = {
     "flux, peak": "counts",
     "columns": "see bayesfred.analysis.sources.source_table",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What a finished run left.
-
-    Attributes
-    ----------
-    chain : Chain
-    diagnostics : Diagnostics
-    field : DisplacementField
-        How far the frame displaces its objects, and how well that is known.
-    summary : astropy.table.Table
-        The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
-    path, page, picture, sources : Path
-        The files: the chain, its report, its picture and its table of sources.
-    photons : PhotonsNeeded, optional
-        What a smaller error would take, where that was asked.
-    """
-
-    chain: Chain
-    diagnostics: Diagnostics
-    field: DisplacementField
-    summary: Table
-    path: Path
-    page: Path
-    picture: Path
-    sources: Path
-    photons: PhotonsNeeded | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Simulated:
-    """A simulated frame.
-
-    Attributes
-    ----------
-    posterior : Posterior
-        Its `counts` are the frame.
-    truth : ndarray, shape (d,), parameter units
-    frame : Path
-        The frame's file.
-    catalogue : Path or None
-        The file of the sources, if they were made with the frame.
-    """
-
-    posterior: Posterior
-    truth: Floats
-    frame: Path
-    catalogue: Path | None
-
-
-@dataclass(frozen=True, eq=False)
-class Study:
-    """What a study found and where it is.
-
-    Attributes
-    ----------
-    result : NoiseStudy or PosteriorCalibration
-    table, summary, picture : Path
-        The files: a row for each frame, the findings, their figure.
-    """
-
-    result: NoiseStudy | PosteriorCalibration
-    table: Path
-    summary: Path
-    picture: Path
-
-    @property
-    def holds(self) -> bool:
-        """Whether every frame could be fitted or, in a calibration, the error bars hold."""
-        if isinstance(self.result, PosteriorCalibration):
-            return self.result.calibrated
-        return not self.result.cells["failed"].any()
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,7 +277,7 @@ def write_results(
     shown = corner_parameters(chain.draws(), chain.parameter_names, corner)
     diagnostics = diagnose(chain, target_ess=target_ess)
     field = displacement_field(chain)
-    table = summary(chain, truth=truth, columns=diagnostics.columns)
+    table = diagnostics.summary(chain, truth=truth)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
     page, picture, sources = outputs.beside(page)
     write_report(
@@ -388,3 +312,37 @@ def naming(run_file: Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{run_file}: {error}") from None
+
+
+def write_study(
+    result: NoiseStudy | PosteriorCalibration, posterior: Posterior, table: Path
+) -> Study:
+    """Write the summary and the figure of a study beside its table.
+
+    Parameters
+    ----------
+    result : NoiseStudy or PosteriorCalibration
+    posterior : Posterior
+        Of one of its frames.
+    table : Path
+        With a row for each frame.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    findings, picture = outputs.beside_study(table)
+    if isinstance(result, NoiseStudy):
+        kind, found, figure = "noise", result.cells, noise_plot(result, posterior.parameters)
+    else:
+        figure = calibration_plot(result, posterior.parameters)
+        kind, found = "sbc", result.quantities
+    record = tables.TableRecord(found, {"study": kind, "message": result.message})
+    tables.write_table(findings, record, overwrite=True)
+    atomic.replace(picture, png(figure))
+    return Study(result, table, findings, picture)

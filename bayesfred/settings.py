@@ -291,6 +291,16 @@ class RunSettings(Section):
     simulation: SimulationSettings | None = None
     study: StudySettings | None = None
 
+    def seeded(self, seed: int) -> RunSettings:
+        """The same run with other random numbers, and without a study."""
+        parts = {"sampling": self.sampling, "simulation": self.simulation}
+        update = {
+            key: part.model_copy(update={"seed": seed})
+            for key, part in parts.items()
+            if part is not None
+        }
+        return self.model_copy(update={**update, "study": None})
+
 
 def read_settings(path: PathLike) -> RunSettings:
     """Read and check a run file.

@@ -4,24 +4,33 @@ Every function prints the record of a function in `commands.py` and returns whet
 """
 
 import json
+import math
+import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
-from bayesfred.analysis import comparison
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
-from bayesfred.pipeline import Result, Simulated, Study
+from bayesfred.records import Compared, Result, Simulated, Study
 from bayesfred.reporting import screen
 
 
-def show_run(result: Result) -> bool:
-    """Print what a run found; whether it is trustworthy is the last line, and what is returned."""
+def show_run(result: Result, *, as_json: bool = False) -> bool:
+    """Print what a run found; whether it is trustworthy is the last line, and what is returned.
+
+    With `as_json` one JSON object is printed instead, see `run_record`.
+    """
     chain, diagnostics = result.chain, result.diagnostics
-    _print(screen.parameter_table(result.summary))
+    if as_json:
+        print(json.dumps(run_record(result), allow_nan=False))
+        return diagnostics.trustworthy
+    console = _console()
+    console.print(screen.parameter_table(result.summary, console.width))
     if chain.n_invalid:
         print(
             f"{chain.n_invalid} log-probabilities were NaN or infinite and taken as -inf: "
@@ -42,6 +51,44 @@ def show_run(result: Result) -> bool:
     return diagnostics.trustworthy
 
 
+def run_record(result: Result) -> dict[str, Any]:
+    """What a run found, as JSON can hold it: numbers that are not finite are None.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    dict
+        `sampled_well` (None where nothing was sampled), `fits_data`, `trustworthy` and `message`
+        of the verdict; `causes`, a dict for each; `displacement`, the sentence; `parameters`, a
+        dict for each row of the summary, by its columns; `files`, the paths of `chain`, `report`,
+        `picture` and `sources`.
+    """
+    diagnostics = result.diagnostics
+    files = {
+        "chain": result.path, "report": result.page, "picture": result.picture,
+        "sources": result.sources,
+    }  # fmt: skip
+    return {
+        **diagnostics.verdict,
+        "causes": [asdict(cause) for cause in diagnostics.causes],
+        "displacement": result.field.message,
+        "parameters": [
+            {key: _plain(row[key]) for key in result.summary.colnames} for row in result.summary
+        ],
+        "files": {key: str(path) for key, path in files.items()},
+    }
+
+
+def _plain(value: Any) -> str | float | None:
+    """A table's text or number."""
+    if isinstance(value, str):
+        return str(value)
+    return float(value) if math.isfinite(value) else None
+
+
 def show_simulated(simulated: Simulated) -> bool:
     """Print which files were written."""
     posterior = simulated.posterior
@@ -55,7 +102,8 @@ def show_simulated(simulated: Simulated) -> bool:
 
 def show_study(done: Study) -> bool:
     """Print a study's findings."""
-    _print(screen.study_table(done.result))
+    console = _console()
+    console.print(screen.study_table(done.result, console.width))
     _print_files(table=done.table, summary=done.summary, picture=done.picture)
     print(done.result.message)
     return done.holds
@@ -63,22 +111,30 @@ def show_study(done: Study) -> bool:
 
 def show_verification(found: Verification) -> bool:
     """Print what holds."""
-    _print(screen.check_table(found.checks))
+    _console().print(screen.check_table(found.checks))
     if found.other_versions:
         print(f"made with {', '.join(found.other_versions)}")
     return found.holds
 
 
-def show_comparison(compared: comparison.Comparison) -> bool:
-    """Print the ranking of models."""
-    _print(screen.comparison_table(compared))
+def show_comparison(compared: Compared) -> bool:
+    """Print the ranking of models, or why there is none."""
+    ranking = compared.ranking
+    if ranking is not None:
+        console = _console()
+        console.print(screen.comparison_table(ranking, console.width))
+    if compared.page:
+        _print_files(page=compared.page)
+    if ranking is None:
+        print(f"not ranked: {compared.reason}")
+        return False
     print(
-        f"chosen: {printable(compared.chosen)}, the one with the fewest parameters that predicts "
+        f"chosen: {printable(ranking.chosen)}, the one with the fewest parameters that predicts "
         "as well as the best"
     )
-    if not compared.reliable:
+    if not ranking.reliable:
         print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
-    return compared.reliable
+    return ranking.reliable
 
 
 def show_cross_check(found: CrossCheck, *, as_json: bool = False) -> bool:
@@ -86,7 +142,8 @@ def show_cross_check(found: CrossCheck, *, as_json: bool = False) -> bool:
     if as_json:
         print(json.dumps(found.record()))
         return found.holds
-    _print(screen.cross_check_table(found))
+    console = _console()
+    console.print(screen.cross_check_table(found, console.width))
     print(
         f"displacements of the halves differ by {found.displacement_rms:.2g} pixel rms, expected "
         f"{found.displacement_expected:.2g}"
@@ -95,9 +152,13 @@ def show_cross_check(found: CrossCheck, *, as_json: bool = False) -> bool:
     return found.holds
 
 
-def _print(table: Table) -> None:
-    # a file or a pipe has no width of its own
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+def _console() -> Console:
+    """Standard output. A file or a pipe has no width of its own: COLUMNS says it, or it is 80."""
+    wide = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
+    plain = bool(os.environ.get("NO_COLOR"))  # rich would still print bold
+    return Console(
+        width=None if wide else 80, force_jupyter=False, color_system=None if plain else "auto"
+    )
 
 
 def _print_files(**named: Path) -> None:

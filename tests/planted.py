@@ -68,7 +68,7 @@ def saturation(seed: int) -> Posterior:
     """The brightest pixels hold the most that the detector can."""
     model = camera(field(seed))
     frame = counts(model, seed)
-    full = np.sort(model.sources.flux)[-12] / (2.0 * np.pi * SIGMA**2)
+    full = np.sort(model.sources.flux)[-24] / (2.0 * np.pi * SIGMA**2)
     return Posterior(model, np.minimum(frame, np.round(full)))
 
 

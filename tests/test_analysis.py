@@ -240,6 +240,7 @@ def chain_at(params: Floats, posterior: Any, **changes: Any) -> Any:
         "log_prob": np.zeros(draws.shape[:3]),
         "accepted": np.full((4, 32), 12),
         "burn_in": 3,
+        "method": "mcmc",
         "estimate": estimate,
         "posterior": lambda: posterior,
     }
@@ -506,9 +507,12 @@ def test_a_psf_that_is_too_wide_is_sampled_well_and_does_not_fit() -> None:
     assert verdict.sampled_well and not verdict.fits_data and not verdict.trustworthy
     assert re.match(
         r"not trustworthy: The model does not fit the counts: deviance \d+\.\d standard deviations "
-        r"above its expectation, expected at most 5\. Sampled well: R-hat",
+        r"above and Pearson's statistic \d+\.\d standard deviations above expectation, 9 of 9 "
+        r"sources matched \(at most 5 are expected\)\. Probable cause: PSF \(\d+% of the misfit\): "
+        r".* Remedy: .*\. Sampled well: R-hat .*\. The error bars leave out .*\.$",
         verdict.message,
     )
+    assert verdict.causes[0].name == "PSF"
 
 
 def test_the_right_psf_is_trustworthy() -> None:

@@ -85,7 +85,7 @@ def run_text(**sections: str) -> str:
 
 def invoke(folder: Path, *args: str | Path, data: Path | None = None) -> Output:
     """Run a command in a folder; what would be a traceback for the user is raised here."""
-    env = {"BAYESFRED_DATA": None if data is None else str(data)}
+    env = {"BAYESFRED_DATA": None if data is None else str(data), "COLUMNS": "120"}
     with contextlib.chdir(folder):
         result = CliRunner().invoke(app, [str(a) for a in args], env=env, catch_exceptions=False)
     return Output(result.exit_code, result.stdout, result.stderr)

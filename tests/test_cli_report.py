@@ -102,14 +102,19 @@ def test_settings_of_a_resumed_run_have_the_seed_of_its_beginning(
     np.testing.assert_array_equal(before.chain, after.chain)
 
 
-def test_report_keeps_settings_notes_and_date(finished: Path, tmp_path: Path) -> None:
+def test_report_keeps_settings_notes_and_date_and_shows_the_pairs_asked_for(
+    finished: Path, tmp_path: Path
+) -> None:
     shutil.copy(finished / "chains" / "run.h5", tmp_path)
-    assert invoke(tmp_path, "report", "run.h5")[0] == 3
+    assert invoke(tmp_path, "report", "run.h5", "--corner", "background, g_vy")[0] == 3
     before, after = finished / "chains" / "run.html", tmp_path / "run.html"
     assert settings_on(after) == settings_on(before)
     assert "stars.csv: 4 sources" in text_on(after)
     made = re.compile(r"frame\.fits, 45 × 60 pixels.*\d{4}-\d\d-\d\d \d\d:\d\d UTC")
     assert made.findall(text_on(after)) == made.findall(text_on(before)) != []
+    assert "2 of 3 parameters" in text_on(after)
+    assert "Posterior: other parameters" in text_on(after)
+    assert "Posterior: other parameters" not in text_on(before)
 
 
 def test_report_replaces_nothing_unasked(finished: Path, tmp_path: Path) -> None:
@@ -120,12 +125,10 @@ def test_report_replaces_nothing_unasked(finished: Path, tmp_path: Path) -> None
         assert code == 2 and said.count("\n") == 1
         assert f"{name}: exists" in said and "--overwrite" in said
         assert (tmp_path / name).read_text() == "precious"
-        assert invoke(tmp_path, "report", "run.h5", "--out", "other.html", "--overwrite")[0] == 3
-        assert (tmp_path / name).read_text() == "precious"
         (tmp_path / name).unlink()
+    assert invoke(tmp_path, "report", "run.h5", "--out", "other.html")[0] == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ["other.html", "other.png", "run.h5"]
     assert invoke(tmp_path, "report", "run.h5", "--out", "other.html")[0] == 2
-    assert invoke(tmp_path, "report", "run.h5")[0] == 3
     (tmp_path / "run.html").write_text("old")
     assert invoke(tmp_path, "report", "run.h5", "--overwrite")[0] == 3
     assert "Settings" in text_on(tmp_path / "run.html")
@@ -149,13 +152,6 @@ def test_report_refuses_in_one_line(
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
 
 
-def test_report_shows_the_parameters_that_are_asked_for(finished: Path, tmp_path: Path) -> None:
-    shutil.copy(finished / "chains" / "run.h5", tmp_path)
-    assert invoke(tmp_path, "report", "run.h5", "--corner", "background, g_vy")[0] == 3
-    page = (tmp_path / "run.html").read_text(encoding="utf-8")
-    assert "2 of 3 parameters" in page and "Posterior: other parameters" in page
-
-
 def test_page_shows_truth_again(finished: Path, tmp_path: Path) -> None:
     chain = open_chain(finished / "chains" / "run.h5")
     assert chain.record is not None and chain.record.truth is None
@@ -164,6 +160,78 @@ def test_page_shows_truth_again(finished: Path, tmp_path: Path) -> None:
     assert invoke(tmp_path, "report", "run.h5")[0] == 3
     assert "truth" in text_on(tmp_path / "run.html")
     assert re.search(r"<td>4\.8[78]\d*</td>", (tmp_path / "run.html").read_text(encoding="utf-8"))
+
+
+# --- runs side by side ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with chains of two models, `a.h5` and `b.h5`, of one frame."""
+    folder = Path(shutil.copytree(finished, tmp_path_factory.mktemp("two") / "runs"))
+    other = RUN.replace("f_terms = [[2, 0, 1, 0]]", "f_terms = [[2, 0, 1, 0], [1, 0, 0, 1]]")
+    (folder / "b.toml").write_text(other.replace("steps = 6", "steps = 20"))
+    assert invoke(folder, "fit", "b.toml")[0] == 3
+    shutil.move(folder / "chains" / "run.h5", folder / "a.h5")
+    shutil.move(folder / "chains" / "b.h5", folder / "b.h5")
+    return folder
+
+
+def test_compare_writes_a_page_if_asked_and_replaces_none(two: Path, tmp_path: Path) -> None:
+    before = sorted(two.iterdir())
+    assert invoke(two, "compare", "a.h5", "b.h5")[0] in (0, 3)
+    assert sorted(two.iterdir()) == before
+    page = tmp_path / "page.html"
+    assert invoke(two, "compare", "a.h5", "b.h5", "--out", str(page))[0] in (0, 3)
+    text = text_on(page)
+    for words in ("Run 1: run", "Run 2: b", "not trustworthy: ", "elpd", "(run 2 − run 1) / sd"):
+        assert words in text
+    assert "Not in every run, but in run 2: f_vx." in text
+    chains = [open_chain(two / name) for name in ("a.h5", "b.h5")]
+    one, other = (chain.draws()[:, -1] for chain in chains)  # the background
+    sd = max(one.std(ddof=1), other.std(ddof=1))
+    difference = f"{(other.mean() - one.mean()) / sd:+.2f}".replace("-", "−")
+    assert f"<td>{difference}</td>" in page.read_text(encoding="utf-8")
+    page.write_text("precious")
+    code, said = invoke(two, "compare", "a.h5", "b.h5", "--out", str(page))
+    assert code == 2 and "page.html: exists" in said and "--overwrite" in said
+    assert page.read_text() == "precious"
+    assert invoke(two, "compare", "a.h5", "b.h5", "--out", str(page), "--overwrite")[0] in (0, 3)
+    assert "Run 1: run" in text_on(page)
+
+
+def test_runs_that_cannot_be_ranked_are_shown_side_by_side(two: Path, tmp_path: Path) -> None:
+    """Of other counts, for one; the exit code says that there is no ranking."""
+    folder = Path(shutil.copytree(two, tmp_path / "here"))
+    (folder / "c.toml").write_text(RUN.replace("background = 5.0", "background = 6.0"))
+    assert invoke(folder, "simulate", "c.toml", "--overwrite") == (0, "")
+    assert invoke(folder, "fit", "c.toml")[0] == 3
+    args = ("compare", "a.h5", "chains/c.h5")
+    assert invoke(folder, *args)[0] == 2
+    assert invoke(folder, *args, "--out", "page.html")[0] == 3
+    text = text_on(folder / "page.html")
+    assert "not ranked: chains/c.h5: counts: got others than those of a.h5" in text
+    assert "Ranking" not in text and "Residuals" in text
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (("a.h5", "b.h5", "--out", "a.h5"), ("a.h5", "named as its report")),
+        (("a.h5", "--out", "page.html"), ("got 1", "two models")),
+        (("a.h5", "a.h5", "--out", "page.html"), ("a.h5", "twice")),
+        (("a.h5", "absent.h5", "--out", "page.html"), ("absent.h5", "no such file")),
+    ],
+)
+def test_compare_refuses_in_one_line(
+    args: tuple[str, ...], words: tuple[str, ...], two: Path
+) -> None:
+    before = {path: path.read_bytes() for path in two.glob("*.h5")}
+    code, said = invoke(two, "compare", *args)
+    assert code == 2 and said.count("\n") == 1
+    assert all(word in said for word in words)
+    assert {path: path.read_bytes() for path in two.glob("*.h5")} == before
+    assert not (two / "page.html").exists()
 
 
 # --- the record -----------------------------------------------------------------------------------

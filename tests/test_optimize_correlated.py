@@ -14,7 +14,8 @@ from scipy import stats
 
 import bayesfred as bf
 from bayesfred._typing import Floats
-from bayesfred.analysis.diagnostics import INFORMATIVE, Diagnostics
+from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.analysis.sensitivity import INFORMATIVE
 from bayesfred.sampling.moves import LaplaceMove
 
 SIDE = 205

@@ -10,7 +10,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map, reject_outliers
-from bayesfred.optimize.matched import FARTHEST, source_light
+from bayesfred.optimize.matched import FARTHEST, enough_matched, source_light
 
 TRUTH = np.append(planted.THETA, planted.LEVEL)
 
@@ -52,8 +52,22 @@ def test_light_found_is_what_a_naive_sum_over_the_frame_finds() -> None:
 
 def test_nothing_but_noise_matches_nothing() -> None:
     estimate = find_map(planted.empty(1))
-    assert estimate.at_maximum and estimate.fits_data
+    assert estimate.at_maximum and not estimate.fits_data
     assert "0 of 48 sources matched" in estimate.message
+    assert "consistent with the noise, but too few sources are matched" in estimate.message
+
+
+def test_faint_sources_of_known_flux_count_together() -> None:
+    """One by one they are lost in the noise, 48 of them are not; without their light they are."""
+    s = planted.field(4)
+    faint = planted.camera(replace(s, flux=np.full(48, 40.0)))
+    for model, enough in (
+        (faint, True),
+        (replace(faint, sources=replace(s, flux=s.flux * 1e-9)), False),
+    ):
+        posterior = Posterior(faint, planted.counts(model, 4))
+        light = source_light(posterior, TRUTH)
+        assert light.matched.sum() < 5 and enough_matched(posterior, light) == enough
 
 
 def test_sources_are_counted_at_the_maximum_not_at_the_start() -> None:

@@ -12,6 +12,13 @@ from scipy.stats import kstest, truncnorm
 from test_model import make_model, make_posterior, make_truth
 
 from bayesfred.errors import InputError
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import simulate
+from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
@@ -157,3 +164,15 @@ def test_importance_efficiency_without_density_is_zero() -> None:
     estimate = MapEstimate(np.zeros(1), np.eye(1), 0.0, 1, "not found")
     chain = laplace(Normal(np.eye(1)), estimate, seed=1)
     assert importance_efficiency(replace(chain, density=density)) == 0.0
+
+
+def test_nested_on_a_hyperparameter_it_is_as_wide_as_the_posterior() -> None:
+    """With the sampler's wider proposals in place of its own the efficiency is 0.89."""
+    model = ForwardModel(
+        Detector((81, 81)), SourceCatalog.grid(4, 18.0, 1e4), GaussianPSF(2.0),
+        PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[(0, 1, 0, 1)]),
+    )  # fmt: skip
+    nuisances = Nuisances(flux="free", position_scatter=True, offset=True)
+    counts = simulate(model, [1e-4, -1e-4], 2.0, seed=1)
+    chain = laplace(Posterior(model, counts, nuisances=nuisances), seed=1, progress=False)
+    assert importance_efficiency(chain) > 0.95

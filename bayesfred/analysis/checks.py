@@ -2,18 +2,19 @@
 
 References
 ----------
+E. Paulson (1942), Annals of Mathematical Statistics 13, 233: a normal deviate from a ratio F.
 E. B. Wilson, M. M. Hilferty (1931), PNAS 17, 684: a normal deviate from a chi-square.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from bayesfred.io.summary_table import Table, make_table
 
-__all__ = ["Check", "check_table", "deviate", "not_tested"]
+__all__ = ["Check", "check_table", "deviate", "deviate_of_ratio", "not_tested", "sums"]
 
 
 class Check(NamedTuple):
@@ -33,12 +34,12 @@ class Check(NamedTuple):
 
 def check_table(checks: Sequence[Check]) -> Table:
     """A table with a row for each check."""
-    rows = list(zip(*checks, strict=True))
     texts = {"name", "meaning"}
+    columns = {name: [getattr(check, name) for check in checks] for name in Check._fields}
     return make_table(
         {
-            name: list(column) if name in texts else np.array(column, dtype=np.float64)
-            for name, column in zip(Check._fields, rows, strict=True)
+            name: column if name in texts else np.array(column, dtype=np.float64)
+            for name, column in columns.items()
         }
     )
 
@@ -48,7 +49,27 @@ def not_tested(name: str, why: str) -> Check:
     return Check(name, math.nan, math.nan, math.nan, math.nan, f"not tested: {why}")
 
 
+def deviate_of_ratio(f: float, dof: int, left: float) -> float:
+    """The normal deviate that is exceeded about as rarely as this F of dof and left degrees."""
+    one, other, root = 2.0 / (9.0 * dof), 2.0 / (9.0 * left), f ** (1.0 / 3.0)
+    return float(((1.0 - other) * root - 1.0 + one) / math.sqrt(other * root**2 + one))
+
+
 def deviate(chi2: float, dof: int) -> float:
     """The normal deviate that is exceeded about as rarely as this chi-square."""
     part = 2.0 / (9.0 * dof)
     return float(((chi2 / dof) ** (1.0 / 3.0) - 1.0 + part) / math.sqrt(part))
+
+
+def sums(fit: Mapping[str, float]) -> list[Check]:
+    """Pearson's statistic and the deviance, from `fit_statistics`."""
+    meanings = {
+        "Pearson": "sum of squared residuals in standard deviations",
+        "deviance": "twice the log-likelihood that a perfect model would gain",
+    }
+    checks = []
+    for name, meaning in meanings.items():
+        value, expected, sd = (fit[f"{name.lower()}{part}"] for part in ("", "_expected", "_sd"))
+        z = (value - expected) / sd if sd > 0.0 else math.nan
+        checks.append(Check(name, value, expected, sd, z, meaning))
+    return checks

@@ -17,37 +17,31 @@ A. Sokal (1996), Monte Carlo methods in statistical mechanics: the window of the
 time.
 """
 
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
-import arviz_base
-import lazy_loader
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from bayesfred._typing import Flags, Floats, Ints
-from bayesfred.analysis.checks import Check, check_table
+from bayesfred._typing import Floats
+from bayesfred.analysis.causes import Cause
+from bayesfred.analysis.checks import check_table, sums
 from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_checks
+from bayesfred.analysis.sensitivity import sensitivities
+from bayesfred.analysis.verdict import (
+    MIN_EFFICIENCY,
+    judge_approximation,
+    judge_fit,
+    judge_sampling,
+)
 from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
+from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
 from bayesfred.sampling.laplace import importance_efficiency
+from bayesfred.sampling.summary import summary
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
-
-# takes long to load, and most of what imports this module judges no chain
-arviz_stats = lazy_loader.load("arviz_stats")
-
-MAX_RHAT = 1.01
-MIN_ACCEPTANCE = 0.1
-MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
-FEWEST = 100  # draws from which a sensitivity is read
-FLAT = 1e-6  # difference of log densities that moves no posterior
-FIELD_POINTS = 9  # along each axis of the frame
-INFORMATIVE = 0.05  # sensitivity; the threshold of Kallioinen et al., and of arviz
 
 
 @dataclass(frozen=True)
@@ -61,11 +55,13 @@ class Diagnostics:
         at the maximum. It says nothing of the model. None where nothing was sampled: the draws are
         those of the Laplace approximation, and what is said of sampling below is nan.
     fits_data : bool
-        Whether the deviance is what the noise makes it, within 5 standard deviations. It says
-        nothing of the sampling.
-    message : str
-        One line: whether the run is trustworthy, how well the model fits, and how well it is
-        sampled, a sentence each.
+        Whether deviance and Pearson's statistic are what the noise makes them, within 5 standard
+        deviations, and enough sources are matched. It says nothing of the sampling.
+    sentences : tuple of str, length 3
+        How well the model fits, and probably why it does not; how well it is sampled; what the
+        error bars leave out.
+    causes : tuple of Cause
+        Why the model does not fit, the most likely cause first; empty where it fits.
     rhat : dict of str to float
         Rank-normalised split R-hat between ensembles, by parameter.
     ess_bulk, ess_tail : dict of str to float
@@ -116,7 +112,8 @@ class Diagnostics:
 
     sampled_well: bool | None
     fits_data: bool
-    message: str
+    sentences: tuple[str, str, str]
+    causes: tuple[Cause, ...]
     rhat: dict[str, float]
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
@@ -159,6 +156,40 @@ class Diagnostics:
         return self.sampled_well and self.fits_data
 
     @property
+    def message(self) -> str:
+        """One line: whether the run is trustworthy, and the three sentences."""
+        return f"{'' if self.trustworthy else 'not '}trustworthy: {' '.join(self.sentences)}"
+
+    @property
+    def verdict(self) -> dict[str, Any]:
+        """What every output says of the run: three flags and the message."""
+        return {
+            "sampled_well": self.sampled_well,
+            "fits_data": self.fits_data,
+            "trustworthy": self.trustworthy,
+            "message": self.message,
+        }
+
+    def summary(self, chain: Chain, *, truth: Floats | None = None) -> Table:
+        """The table of parameters, with what is said of each here and the verdict as its `meta`.
+
+        Parameters
+        ----------
+        chain : Chain
+            The one that was judged.
+        truth : ndarray, shape (d,), parameter units, optional
+            Values that a simulation used.
+
+        Returns
+        -------
+        astropy.table.Table
+            See `bayesfred.sampling.summary.summary`.
+        """
+        table = summary(chain, truth=truth, columns=self.columns)
+        table.meta.update(self.verdict)
+        return table
+
+    @property
     def columns(self) -> dict[str, dict[str, float]]:
         """What there is to say of every parameter, for `bayesfred.sampling.summary.summary`."""
         return {
@@ -176,8 +207,9 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
 
     Sampled well means: largest R-hat at most 1.01, every bulk and tail effective sample size at
     least `target_ess`, at least one move in ten accepted, and a MAP at which the gradient vanishes.
-    The model fits where the deviance at the MAP is within 5 standard deviations of its expectation.
-    Of draws of the Laplace approximation the importance efficiency is judged instead.
+    The model fits where deviance and Pearson's statistic at the MAP are within 5 standard
+    deviations of their expectations and enough sources are matched; else `causes` says why. Of
+    draws of the Laplace approximation the importance efficiency is judged instead.
 
     Parameters
     ----------
@@ -201,50 +233,36 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape
-    sampled = chain.method == "mcmc"
-    if sampled:
+    rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
+    acceptance = efficiency = np.nan
+    sampled_well = None
+    if chain.method == "mcmc":
         rhat, bulk, tail = convergence(kept)
         walkers = kept.transpose(3, 0, 2, 1).reshape(len(names), n_ensembles * n_walkers, n_steps)
         tau = np.array([autocorrelation_time(series) for series in walkers])
         acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
-        efficiency = np.nan
-        failures = _failures(rhat, np.minimum(bulk, tail), acceptance, chain, target_ess)
-        sampling = (
-            f"Not sampled well: {'; '.join(failures)}."
-            if failures
-            else f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
-            f"{min(bulk.min(), tail.min()):.0f}, acceptance {acceptance:.1%}."
+        sampled_well, sampling = judge_sampling(
+            chain, rhat, np.minimum(bulk, tail), acceptance, target_ess
         )
     else:
-        rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
-        acceptance, efficiency = np.nan, importance_efficiency(chain)
-        failures = _approximation_failures(efficiency, chain)
-        sampling = (
-            f"Not sampled, and errors of the Laplace approximation do not hold: "
-            f"{'; '.join(failures)}."
-            if failures
-            else "Not sampled: errors are those of the information at the maximum (importance "
-            f"efficiency {efficiency:.0%})."
-        )
+        efficiency = importance_efficiency(chain)
+        sampling = judge_approximation(chain, efficiency)
     fit = fit_statistics(posterior, chain.estimate.params)
-    fits_data = abs(misfit(fit)) <= CONSISTENT
-    trusted = "not " if failures or not fits_data else ""
-    message = f"{trusted}trustworthy: {_fit_sentence(fit)} {sampling}"
-    residuals, checks = None, _sums(fit)
+    fitted = judge_fit(posterior, chain.estimate.params, fit)
+    residuals, checks = None, sums(fit)
     if isinstance(posterior, Posterior):
         residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
         checks += residuals.checks
     if predictive:
-        draws = _draws(chain)
+        draws = chain.draws()
         some = np.linspace(0, len(draws) - 1, min(predictive, len(draws))).astype(int)
         checks += predictive_checks(posterior, draws[some], seed=chain.seed)
-    prior, likelihood = _sensitivities(chain, posterior)
-    dominated = prior >= INFORMATIVE
-    dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
+    sensitivity = sensitivities(chain)
     return Diagnostics(
-        sampled_well=not failures if sampled else None,
-        fits_data=fits_data,
-        message=message,
+        sampled_well=sampled_well,
+        fits_data=fitted.fits_data,
+        sentences=(fitted.sentence, sampling, fitted.omitted),
+        causes=fitted.causes,
         rhat=_by_name(names, rhat),
         ess_bulk=_by_name(names, bulk),
         ess_tail=_by_name(names, tail),
@@ -253,9 +271,9 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         tau=_by_name(names, tau),
         acceptance=acceptance,
         n_draws=n_ensembles * n_steps * n_walkers,
-        prior_sensitivity=_by_name(names, prior),
-        likelihood_sensitivity=_by_name(names, likelihood),
-        prior_dominated=tuple(np.array(names)[dominated].tolist()),
+        prior_sensitivity=_by_name(names, sensitivity.prior),
+        likelihood_sensitivity=_by_name(names, sensitivity.likelihood),
+        prior_dominated=tuple(np.array(names)[sensitivity.prior_dominated].tolist()),
         residuals=residuals,
         checks=check_table(checks),
         **fit,
@@ -288,129 +306,5 @@ def autocorrelation_time(series: Floats, window: float = 5.0) -> float:
     return float(tau[closed[0] if closed.size else -1])
 
 
-def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
-    """Which of these parameters matter to what is measured, shape (number of parameters,).
-
-    A frame hardly tells u x from x^2, as u is nearly x: it knows the sum of two such coefficients,
-    the prior their difference, and the difference moves nothing. So a coefficient of the distortion
-    is judged by displacements. With W the design matrix of f and g at points all over the frame,
-    W theta is the displacement, and (W^T W theta)_k its component along the pattern that a unit of
-    coefficient k makes. It is this component whose sensitivity to the prior counts.
-    """
-    d = posterior.model.polynomial
-    visible = np.ones(parameters.size, dtype=bool)
-    terms = parameters[parameters < d.n_terms]
-    if not terms.size:
-        return visible
-    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
-    x, y = (c.ravel() for c in np.meshgrid(*np.linspace(-half, half, FIELD_POINTS).T))
-    u, v = d.image_position(chain.estimate.params[: d.n_terms], x, y)
-    imaged = np.isfinite(u + v)
-    design = d.design_matrix(u[imaged], v[imaged], x[imaged], y[imaged]).reshape(-1, d.n_terms)
-    draws, names = _draws(chain), tuple(chain.parameter_names[k] for k in terms)
-    components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
-    sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
-    visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
-    return visible
-
-
-def _draws(chain: Chain) -> Floats:
-    """All draws after burn-in, walker by walker, shape (n, d)."""
-    kept = chain.chain[:, chain.burn_in :]
-    return kept.swapaxes(1, 2).reshape(-1, len(chain.parameter_names))
-
-
-def _sensitivities(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats]:
-    """Power-scaling sensitivity of every parameter to prior and likelihood, each shape (d,)."""
-    names = chain.parameter_names
-    draws = _draws(chain)
-    log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
-    log_prior = posterior.log_prior(draws)
-    return _sensitivity(names, draws, log_prior), _sensitivity(names, draws, log_prob - log_prior)
-
-
-def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Floats:
-    """Sensitivity of every parameter to one factor of the posterior, shape (d,).
-
-    `log_part` is the factor's logarithm at the draws, shape (n,).
-    """
-    if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
-        return np.full(len(names), np.nan)
-    if np.ptp(log_part) < FLAT:
-        return np.zeros(len(names))
-    posterior = {name: draws[None, :, k] for k, name in enumerate(names)}
-    data = arviz_base.from_dict({"posterior": posterior, "log_prior": {"part": log_part[None]}})
-    with (
-        warnings.catch_warnings(),
-        np.errstate(invalid="ignore"),
-        threadpool_limits(1, user_api="blas"),
-    ):
-        warnings.filterwarnings("ignore", message="Number of tail draws")
-        try:
-            sensitivity = arviz_stats.psense(data)
-        except ValueError:  # hardly a draw differs from another
-            return np.full(len(names), np.nan)
-    return np.array([float(sensitivity[name]) for name in names])
-
-
 def _by_name(names: tuple[str, ...], values: Floats) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
-
-
-def _sums(fit: Mapping[str, float]) -> list[Check]:
-    """Pearson's statistic and the deviance."""
-    meanings = {
-        "Pearson": "sum of squared residuals in standard deviations",
-        "deviance": "twice the log-likelihood that a perfect model would gain",
-    }
-    checks = []
-    for name, meaning in meanings.items():
-        value, expected, sd = (fit[f"{name.lower()}{part}"] for part in ("", "_expected", "_sd"))
-        z = (value - expected) / sd if sd > 0.0 else float("nan")
-        checks.append(Check(name, value, expected, sd, z, meaning))
-    return checks
-
-
-def _fit_sentence(fit: Mapping[str, float]) -> str:
-    """Say whether the model fits the counts."""
-    excess = misfit(fit)
-    side = "below" if excess < 0 else "above"
-    deviance = f"deviance {abs(excess):.1f} standard deviations {side} its expectation"
-    if abs(excess) <= CONSISTENT:
-        return f"The model fits the counts: {deviance}."
-    return f"The model does not fit the counts: {deviance}, expected at most {CONSISTENT:.0f}."
-
-
-def _failures(
-    rhat: Floats, ess: Floats, acceptance: float, chain: Chain, target_ess: float
-) -> list[str]:
-    """What is wrong with the sampling, criterion by criterion."""
-    names = chain.parameter_names
-    worst, least = int(np.argmax(rhat)), int(np.argmin(ess))
-    failures = []
-    if not rhat[worst] <= MAX_RHAT:
-        failures.append(f"R-hat {rhat[worst]:.3f} of {names[worst]} exceeds {MAX_RHAT}")
-    if not ess[least] >= target_ess:
-        failures.append(
-            f"effective sample size {ess[least]:.0f} of {names[least]} is below {target_ess:.0f}"
-        )
-    if not acceptance >= MIN_ACCEPTANCE:
-        failures.append(f"acceptance {acceptance:.1%} is below {MIN_ACCEPTANCE:.0%}")
-    return failures + _not_at_maximum(chain)
-
-
-def _approximation_failures(efficiency: float, chain: Chain) -> list[str]:
-    """What is wrong with the Laplace approximation."""
-    failures = _not_at_maximum(chain)
-    if not efficiency >= MIN_EFFICIENCY:
-        failures.append(
-            f"the posterior is not normal (importance efficiency {efficiency:.0%} is below "
-            f"{MIN_EFFICIENCY:.0%}): sample it"
-        )
-    return failures
-
-
-def _not_at_maximum(chain: Chain) -> list[str]:
-    if chain.estimate.at_maximum:
-        return []
-    return [f"the MAP is not at the maximum ({chain.estimate.message})"]

@@ -23,15 +23,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import PathLike
@@ -40,6 +31,7 @@ from bayesfred.io import tables
 from bayesfred.io.lock import only_writer
 from bayesfred.io.paths import may_write
 from bayesfred.model.threads import one_thread
+from bayesfred.sampling.progress import progress_bar
 from bayesfred.sampling.sampler import versions
 
 WAITING = 4  # tasks sent ahead for each worker that is known
@@ -314,24 +306,14 @@ def cluster(address: str) -> Iterator[Executor]:
 @contextmanager
 def _progress(total: int, completed: int, show: bool) -> Iterator[Callable[[bool], None]]:
     """A bar that is told of every answer whether the task failed."""
-    bar = Progress(
-        TextColumn("study"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[failed]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True),
-        console=Console(stderr=True),
-        disable=not show,
-    )
     failures = 0
-    with bar:
-        task = bar.add_task("", total=total, completed=completed, failed="")
+    with progress_bar("study", show=show) as tell:
 
         def update(failed: bool) -> None:
-            nonlocal failures
+            nonlocal failures, completed
             failures += failed
-            bar.update(task, advance=1, failed=f"{failures} failed" if failures else "")
+            completed += 1
+            tell(completed, total, f"{completed}/{total}" + f" {failures} failed" * (failures > 0))
 
         yield update
 

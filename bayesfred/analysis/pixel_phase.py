@@ -5,7 +5,9 @@ pixel the image lies, as soon as pixels are coarse. So the displacements y of th
 model are fitted by a constant and two harmonics of the phase, sin and cos of 2 pi phase and 4 pi
 phase. The fit of the model has taken its part of y: with V its variances, D the derivatives of the
 images by the parameters and C the covariance of these, the covariance of y is V - D C D^T. The
-chi-square of the four amplitudes is judged by what of it is left to them.
+chi-square of the four amplitudes is judged by what of it is left to them. Where positions scatter,
+the scatter at the maximum is too small by what the coefficients took, so the rest of y gives the
+scale of the errors, and the ratio of the two is an F.
 
 References
 ----------
@@ -20,7 +22,7 @@ from scipy import linalg
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.absorbed import responses
-from bayesfred.analysis.checks import Check, deviate, not_tested
+from bayesfred.analysis.checks import Check, deviate, deviate_of_ratio, not_tested
 from bayesfred.analysis.sources import SourceFits
 from bayesfred.model.posterior import Posterior
 
@@ -41,6 +43,7 @@ class PixelPhase(NamedTuple):
     covariance: Floats  # (4, 4) of the last four
     chi2: float  # of the last four
     dof: int  # 0 where nothing could be tested
+    left: float  # degrees of freedom that give the scale of the errors; inf where it is known
 
 
 def harmonics(phase: Floats) -> Floats:
@@ -78,15 +81,21 @@ def pixel_phase(
     phase = place - np.rint(place)
     u, v = (
         _fit_harmonics(
-            phase[:, k], fits.moved[:, k] / step, variance[:, k], (moves[:, k], covariance)
+            phase[:, k], fits.moved[:, k] / step, variance[:, k], (moves[:, k], covariance),
+            scaled=posterior.nuisances.position_scatter,
         )
         for k in range(2)
-    )
+    )  # fmt: skip
     return u, v
 
 
 def _fit_harmonics(
-    phase: Floats, displacement: Floats, variance: Floats, absorbs: tuple[Floats, Floats]
+    phase: Floats,
+    displacement: Floats,
+    variance: Floats,
+    absorbs: tuple[Floats, Floats],
+    *,
+    scaled: bool = False,
 ) -> PixelPhase:
     """Weighted least squares of the harmonics, with the covariance that the fit leaves them."""
     some = np.isfinite(displacement) & np.isfinite(variance) & np.isfinite(phase)
@@ -94,14 +103,13 @@ def _fit_harmonics(
     waves, (moves, covariance) = harmonics(phase[some]), absorbs
     size = waves.shape[1]
     none = PixelPhase(
-        phase[some], y, sd, np.zeros(size), np.zeros((size - 1, size - 1)), math.nan, 0
+        phase[some], y, sd, np.zeros(size), np.zeros((size - 1, size - 1)), math.nan, 0, math.inf
     )
     if y.size < FEWEST:
         return none
     weighted = waves / sd[:, None]
     normal = weighted.T @ weighted
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    if np.linalg.cond(normal * np.outer(scale, scale)) > 1e6:  # the phases do not differ
+    if np.linalg.cond(weighted) > 1e3:  # the phases do not differ
         return none
     inverse = np.linalg.inv(normal)
     gain = inverse @ (weighted / sd[:, None]).T
@@ -110,7 +118,15 @@ def _fit_harmonics(
     values, vectors = linalg.eigh(left, inverse[1:, 1:])
     kept = values > LEFT
     amplitudes = (vectors[:, kept].T @ beta[1:]) ** 2 / values[kept]
-    return PixelPhase(phase[some], y, sd, beta, left, float(amplitudes.sum()), int(kept.sum()))
+    chi2, rest = float(amplitudes.sum()), math.inf
+    if scaled:
+        taken = moves[some] / sd[:, None]
+        rest = y.size - size - float(np.trace(taken @ covariance @ taken.T))
+        if rest < 1.0:
+            return none
+        scale_squared = float(np.sum(((y - waves @ beta) / sd) ** 2)) / rest
+        left, chi2 = left * scale_squared, chi2 / scale_squared
+    return PixelPhase(phase[some], y, sd, beta, left, chi2, int(kept.sum()), rest)
 
 
 def phase_check(fit: PixelPhase, axis: str) -> Check:
@@ -121,7 +137,11 @@ def phase_check(fit: PixelPhase, axis: str) -> Check:
     trace = max(float(np.trace(fit.covariance)), 0.0)
     expected = math.sqrt(trace)
     sd = math.sqrt(float(np.sum(fit.covariance**2)) / (2.0 * trace)) if trace else math.nan
+    if math.isinf(fit.left):
+        z = deviate(fit.chi2, fit.dof)
+    else:
+        z = deviate_of_ratio(fit.chi2 / fit.dof, fit.dof, fit.left)
     return Check(
-        name, float(np.linalg.norm(fit.coefficients[1:])), expected, sd, deviate(fit.chi2, fit.dof),
+        name, float(np.linalg.norm(fit.coefficients[1:])), expected, sd, z,
         "displacement of the sources that depends on the position within the pixel, pixel",
     )  # fmt: skip

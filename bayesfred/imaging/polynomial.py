@@ -354,10 +354,9 @@ class Polynomial:
 
         Parameters
         ----------
-        theta
-            As for `image_position`.
+        theta : array_like, shape (n_terms,), pixel^(1 - degree)
         u, v : ndarray, shape (points,), pixel
-        offset
+        offset : array_like, shape (2,), pixel
             As for `image_position`.
 
         Returns

@@ -12,7 +12,7 @@ from bayesfred.errors import InputError
 from bayesfred.io import atomic
 from bayesfred.io.paths import may_write
 
-__all__ = ["beside", "make_folder", "may_write_page"]
+__all__ = ["beside", "beside_study", "make_folder", "may_write_page"]
 
 
 def beside(path: Path) -> tuple[Path, Path, Path]:
@@ -33,6 +33,25 @@ def beside(path: Path) -> tuple[Path, Path, Path]:
     """
     page, picture, sources = (path.with_suffix(s) for s in (".html", ".png", ".sources.ecsv"))
     return page, picture, sources
+
+
+def beside_study(table: Path) -> tuple[Path, Path]:
+    """Name the summary and the picture of a study's table.
+
+    Parameters
+    ----------
+    table : Path
+
+    Returns
+    -------
+    summary, picture : Path
+
+    Examples
+    --------
+    >>> [path.name for path in beside_study(Path("run.noise.ecsv"))]
+    ['run.noise.summary.ecsv', 'run.noise.png']
+    """
+    return table.with_name(f"{table.stem}.summary.ecsv"), table.with_suffix(".png")
 
 
 def may_write_page(page: Path, *others: Path, inputs: Sequence[Path], overwrite: bool) -> None:

@@ -31,7 +31,8 @@ class MapEstimate:
         Whether the gradient vanishes within 1e-3 standard deviations, however well the model fits;
         of parameters at a bound of their prior it may point out of the support.
     fits_data : bool
-        Whether the deviance there is what the noise makes it, within 5 standard deviations.
+        Whether deviance and Pearson's statistic there are what the noise makes them, within 5
+        standard deviations, and enough sources are matched.
     """
 
     params: Floats

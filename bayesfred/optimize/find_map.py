@@ -1,6 +1,6 @@
 """The posterior's maximum: `starts` says where to begin, `newton` maximises, here it is judged."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -11,8 +11,8 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.determined import undetermined
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
-from bayesfred.optimize.matched import source_light
+from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
+from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
@@ -180,14 +180,15 @@ def _judged(
     given: Posterior, posterior: Posterior, top: NewtonResult, evaluations: int, path: str
 ) -> MapEstimate:
     """The maximum of what is kept of the given posterior, and whether the model fits there."""
-    matched, sources = source_light(posterior, top.params).matched, len(posterior.model.sources)
-    how = f"{path and f' from {path}'}, {matched.sum()} of {sources} sources matched"
-    excess = misfit(fit_statistics(posterior, top.params))
-    rejecting = posterior is not given
+    light, sources = source_light(posterior, top.params), len(posterior.model.sources)
+    how = f"{path and f' from {path}'}, {light.matched.sum()} of {sources} sources matched"
+    fit, rejecting = fit_statistics(posterior, top.params), posterior is not given
     if rejecting:
         pixels = given.mask.sum() - posterior.mask.sum()
         how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
-    return _estimate(posterior, top, evaluations, how, excess, _advice(excess, rejecting))
+    enough = enough_matched(posterior, light)
+    fits = consistent(fit) and enough
+    return _estimate(posterior, top, evaluations, how, (fits, _advice(fit, enough, rejecting)))
 
 
 def _estimate(
@@ -195,11 +196,10 @@ def _estimate(
     top: NewtonResult,
     evaluations: int,
     how: str,
-    excess: float = 0.0,
-    advice: str = "",
+    judged: tuple[bool, str] = (True, ""),
 ) -> MapEstimate:
-    """The record of a maximum, where a frame's residuals have this excess."""
-    at_maximum, fits = top.distance < CLOSENESS, abs(excess) <= CONSISTENT
+    """The record of a maximum, with whether a frame's model fits there and what is said of it."""
+    at_maximum, (fits, advice) = top.distance < CLOSENESS, judged
     message = (
         f"gradient {top.distance:.1g} standard deviations from zero after {evaluations} "
         f"evaluations{how}"
@@ -217,19 +217,26 @@ def _estimate(
     )
 
 
-def _advice(excess: float, rejecting: bool) -> str:
+def _advice(fit: Mapping[str, float], enough: bool, rejecting: bool) -> str:
     """Whether the residuals are consistent with the noise, and what to do where they are not."""
-    if abs(excess) <= CONSISTENT:
-        return "residuals consistent with the noise"
+    name = max(("deviance", "pearson"), key=lambda each: abs(misfit(fit, each)))
+    excess, said = misfit(fit, name), "deviance" if name == "deviance" else "Pearson's statistic"
+    if consistent(fit):
+        if enough:
+            return "residuals consistent with the noise"
+        return (
+            "residuals consistent with the noise, but too few sources are matched: check the "
+            "catalogue's columns, unit and origin"
+        )
     if not excess < 0:
         outliers = "" if rejecting else (
             ", unmatched sources or spurious detections (reject_outliers leaves them out)"
         )  # fmt: skip
         return (
-            f"but the residuals exceed the noise (deviance {excess:.0f} standard deviations above "
+            f"but the residuals exceed the noise ({said} {excess:.0f} standard deviations above "
             f"its expectation): look at them for a wrong PSF, wrong fluxes, missing terms{outliers}"
         )
     return (
-        f"but the residuals are less than the noise (deviance {-excess:.0f} standard deviations "
+        f"but the residuals are less than the noise ({said} {-excess:.0f} standard deviations "
         "below its expectation): check gain and read noise"
     )

@@ -39,7 +39,8 @@ from bayesfred.model.posterior import Posterior
 
 BLOCK = 2**16  # pixels
 
-# The model fits where the deviance is within this many standard deviations of its expectation.
+# The model fits where deviance and Pearson's statistic are within this many standard deviations of
+# their expectations.
 CONSISTENT = 5.0
 
 
@@ -87,6 +88,11 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     }
 
 
-def misfit(fit: Mapping[str, float]) -> float:
-    """By how many standard deviations the deviance of `fit_statistics` exceeds its expectation."""
-    return float((fit["deviance"] - fit["deviance_expected"]) / fit["deviance_sd"])
+def misfit(fit: Mapping[str, float], name: str = "deviance") -> float:
+    """By how many standard deviations a sum of `fit_statistics` exceeds its expectation."""
+    return float((fit[name] - fit[f"{name}_expected"]) / fit[f"{name}_sd"])
+
+
+def consistent(fit: Mapping[str, float]) -> bool:
+    """Whether deviance and Pearson's statistic are what the noise makes them."""
+    return all(abs(misfit(fit, name)) <= CONSISTENT for name in ("deviance", "pearson"))

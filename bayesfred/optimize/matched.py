@@ -132,6 +132,29 @@ def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     return SourceLight(position, s, inside, matched, power, ratio, displacement, displacement_sd)
 
 
+def enough_matched(posterior: Posterior, light: SourceLight) -> bool:
+    """Whether the counts show sources enough for the fit to mean anything.
+
+    Half of the sources in the frame, or half as many as there are coefficients to be found: a
+    source gives two equations. Sources of known flux that are too faint one by one count together.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    light : SourceLight
+
+    Returns
+    -------
+    bool
+    """
+    faint = posterior.nuisances.flux != "free" and light.pooled > SIGNIFICANCE
+    if faint and light.pooled > FAINTEST * float(np.sqrt(light.power.sum())):
+        return True
+    coefficients = posterior.model.distortion.n_terms + 2 * posterior.nuisances.offset
+    needed = 0.5 * min(int(light.inside.sum()), coefficients)
+    return bool(light.matched.sum() >= max(needed, 1.0))
+
+
 def _filtered(
     place: Floats, reach: Ints, s: float, residual: Floats, variance: Floats, mask: Flags
 ) -> Floats:

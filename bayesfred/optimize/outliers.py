@@ -110,7 +110,8 @@ def reject_once(
     for tolerance in tolerances:
         missing, mask = residuals.outliers(tolerance)
         lost = missing | ~mask[residuals.row, residuals.column]
-        if mask.any() and not residuals.too_many(lost):
+        left = mask.any() and not residuals.none_left(missing)
+        if left and not residuals.too_many(lost):
             return Kept(_part(posterior, missing, mask), missing, lost)
     return keep_all(posterior, params)[0]
 
@@ -142,6 +143,11 @@ class _Residuals:
     def too_many(self, lost: Flags) -> bool:
         return bool(lost[self.inside].sum() > MOST * self.inside.sum())
 
+    def none_left(self, missing: Flags) -> bool:
+        """Whether no source remains in the frame, of which a posterior could be made."""
+        s, (ny, nx) = self.posterior.model.sources, self.posterior.model.detector.fine_shape
+        return not np.any(~missing & (np.abs(s.x) <= 0.5 * nx) & (np.abs(s.y) <= 0.5 * ny))
+
     def outliers(self, tolerance: float) -> tuple[Flags, Flags]:
         """Which sources are missing, shape (n,), and the pixels without detections, (ny, nx)."""
         p, s = self.posterior, self.width
@@ -165,7 +171,7 @@ class _Residuals:
             positions = vertex(height, row, column)
             absent = self._absent(positions, flux, missing)
             missing[absent[absent >= 0]] = True
-            if missing.all():
+            if self.none_left(missing):
                 break
             if np.any(absent >= 0):
                 expected = _part(p, missing, p.mask).expected_counts(self.params)

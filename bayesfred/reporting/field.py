@@ -84,7 +84,8 @@ def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -
     enlarged = _round(0.4 * spacing / max(np.max(axes[among], initial=0.0), 1e-12))
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     size = 2.0 * enlarged * axes
-    for which, colour in ((among, TRUTH_COLOUR), (~among, EXTRAPOLATED)):
+    fits = size[:, 1] < 1.5 * spacing
+    for which, colour in ((among, TRUTH_COLOUR), (~among & fits, EXTRAPOLATED)):
         ax.add_collection(
             EllipseCollection(
                 size[which, 1], size[which, 0], angle[which], units="xy", offsets=at[which],
@@ -107,12 +108,17 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
     known = np.isfinite(at + off + sd).all(axis=1)
     at, off, sd = at[known], off[known], sd[known]
     ax.plot(at[:, 0], at[:, 1], ".", color="0.3", markersize=3)
-    far = np.hypot(*(off / sd).T) > SIGNIFICANT if len(at) else np.zeros(0, dtype=bool)
-    colours = np.where(far, TRUTH_COLOUR, POSTERIOR_COLOUR)
-    arrows = _arrows(ax, at, off, 3.0 * _spacing(field), unit, colours)
+    far = np.hypot(*(off / sd).T) > SIGNIFICANT
+    length = np.hypot(*off.T)
+    # a faint source's arrow, which is noise, would make those of the others too small to be seen
+    short = length <= 3.0 * np.quantile(length, 0.95) if len(at) else np.zeros(0, dtype=bool)
+    colours = np.where(far, TRUTH_COLOUR, POSTERIOR_COLOUR)[short]
+    arrows = _arrows(ax, at[short], off[short], 3.0 * _spacing(field), unit, colours)
+    by_chance = len(at) * math.exp(-0.5 * SIGNIFICANT**2)  # of normal errors along two axes
+    ax.plot(*at[far & ~short].T, "x", color=TRUTH_COLOUR)
     ax.set_title(
         f"sources, off the model{arrows}\n{far.sum()} of {len(at)} by more than "
-        f"{SIGNIFICANT:.0f} standard deviations{', orange' if far.any() else ''}",
+        f"{SIGNIFICANT:.0f} sd (orange), {by_chance:.0f} by chance",
         loc="left", fontsize=11,
     )  # fmt: skip
 
@@ -144,6 +150,8 @@ def _arrows(
 
 
 def _times(enlarged: float) -> str:
+    if enlarged < 1.0:
+        return f"reduced to {enlarged:.10g}"
     return "to scale" if enlarged == 1.0 else f"{enlarged:,.10g} times enlarged"
 
 

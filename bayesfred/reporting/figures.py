@@ -80,9 +80,10 @@ def page_figures(
             "Displacement",
             "Above: from the object to its image, with the error that the posterior gives it. What "
             "is hatched lies beyond the sources, where only the terms of the distortion say what "
-            "happens; its ellipses are grey. Below: by how much the counts of each source say that "
-            "its image is off the place where the model has it; arrows that agree with their "
-            "neighbours mean a missing term.",
+            "happens; its ellipses are grey, and left out where they are large. Below: by how much "
+            "the counts of each source say that its image is off the place where the model has it; "
+            "arrows that agree with their neighbours mean a missing term. The longest arrows are "
+            "left out; a cross stands for one of more than 3 standard deviations.",
             field.message,
             field_plot(field, diagnostics.sources, posterior.model.detector.binning),
         ),
@@ -262,9 +263,8 @@ def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats,
     model = posterior.model
     params = dict(zip(chain.parameter_names, chain.estimate.params, strict=True))
     theta = chain.estimate.params[: model.distortion.n_terms]
-    x = model.sources.x + params.get("offset_x", 0.0)
-    y = model.sources.y + params.get("offset_y", 0.0)
-    u, v = model.distortion.image_position(theta, x, y)
+    offset = params.get("offset_x", 0.0), params.get("offset_y", 0.0)
+    u, v = model.polynomial.image_position(theta, model.sources.x, model.sources.y, offset=offset)
     binning = model.detector.binning
     half_width = max(4, math.ceil(3.5 * params.get("psf_sigma", model.psf.sigma) / binning))
     return u / binning, v / binning, half_width

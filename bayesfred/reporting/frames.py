@@ -21,11 +21,18 @@ from matplotlib.image import AxesImage
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.posterior import Posterior
 
-__all__ = ["FittedFrame", "draw_triptych", "frame_triptych", "star_panels", "triptych_height"]
+__all__ = [
+    "FittedFrame",
+    "draw_triptych",
+    "frame_triptych",
+    "residual_panels",
+    "star_panels",
+    "triptych_height",
+]
 
 # Light where there is little: a page in dark mode inverts its figures, see `template.html`.
 COUNTS_MAP, RESIDUAL_MAP = "gray_r", "RdBu_r"
-MASKED = "#a9d18e"  # a colour that neither map has
+MASKED = "#cfe3bf"  # a colour that neither map has
 RESIDUAL_LIMIT = 5.0
 TRIPTYCH_MARGIN, TRIPTYCH_SIDE = 0.7, 5.6
 MAX_STARS = 24
@@ -84,6 +91,36 @@ def frame_triptych(fitted: FittedFrame) -> Figure:
     """
     fig = Figure(figsize=(19, triptych_height(fitted)), dpi=100, layout="constrained")
     draw_triptych(fig, fig.subplots(1, 3), fitted)
+    return fig
+
+
+def residual_panels(frames: Sequence[FittedFrame]) -> Figure:
+    """Residuals of several models, three in a row, on one scale and numbered from 1.
+
+    Parameters
+    ----------
+    frames : sequence of FittedFrame
+
+    Returns
+    -------
+    Figure
+    """
+    columns = min(len(frames), 3)
+    rows = -(-len(frames) // columns)
+    height = rows * max(triptych_height(frame) for frame in frames)
+    fig = Figure(figsize=(6.2 * columns + 0.8, height), dpi=100, layout="constrained")
+    axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    for k, (ax, fitted) in enumerate(zip(axes, frames, strict=False), 1):
+        ny, nx = fitted.counts.shape
+        extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
+        image = _show(ax, fitted.residual(), _sigma_norm(), RESIDUAL_MAP, extent)
+        ax.set_title(f"run {k}", fontsize=15)
+        ax.set_xlabel("u / pixel", fontsize=13)
+        ax.set_ylabel("v / pixel", fontsize=13)
+        ax.tick_params(labelsize=12)
+    for ax in axes[len(frames) :]:
+        ax.set_visible(False)
+    fig.colorbar(image, ax=list(axes)).set_label("residual / sigma", fontsize=13)
     return fig
 
 

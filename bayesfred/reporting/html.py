@@ -104,7 +104,7 @@ def write_report(
     made = "bayesfred " + chain.versions["bayesfred"]
     if chain.record:
         made = f"{made_text(record)}, {made}"
-    heading, subtitle = record.title, described_model(record, posterior)
+    heading, subtitle = record.title or path.stem, described_model(record, posterior)
     page = render(
         "run.html",
         title=f"{heading}: {subtitle}; {made}",
@@ -113,7 +113,7 @@ def write_report(
         made=made,
         result=result,
         diagnostics=diagnostics,
-        causes=getattr(diagnostics, "causes", ()),
+        causes=diagnostics.causes,
         rows=[_row(dict(row), parameters[row["name"]], levels[row["name"]]) for row in summary],
         prior_dominated=Markup(", ").join(
             html_symbol(parameters[name]) for name in diagnostics.prior_dominated

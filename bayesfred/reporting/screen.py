@@ -1,8 +1,11 @@
-"""Results as tables for a terminal. They are only formatted here; `bayesfred.cli` prints them."""
+"""Results as tables for a terminal. They are only formatted here; `bayesfred.show` prints them.
+
+A table has the columns that fit the terminal's width. What says least gives way first.
+"""
 
 import math
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from rich.markup import escape
@@ -26,49 +29,72 @@ __all__ = [
 ]
 
 
-def parameter_table(summary: Any) -> Table:
+class _Column(NamedTuple):
+    """A column of numbers, or of texts."""
+
+    head: str
+    cells: list[str]
+    gives_way: int = 0  # the largest first; 0: never
+    justify: Literal["left", "right"] = "right"
+
+
+def parameter_table(summary: Any, width: int) -> Table:
     """Lay out the table of parameters: values, how well they are sampled, and the prior's part.
 
     Parameters
     ----------
     summary : astropy.table.Table
         See `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
+    width : int
+        Characters in a line. Where they do not suffice, columns are left out: MAP first, then
+        prior sensitivity, R-hat, truth, ESS and z.
 
     Returns
     -------
     rich.table.Table
         Every row's numbers are in one power of ten; the effective sample size is the smaller of
-        those of the centre and of the tails.
+        those of the centre and of the tails. Columns without numbers are left out.
     """
-    with_truth = "truth" in summary.colnames
-    heads = ["MAP", "posterior mean +- sd"]
-    table = _table(
-        "parameter", *(["truth", *heads, "z"] if with_truth else heads),
-        "px at corner", "R-hat", "ESS", "prior",
-    )  # fmt: skip
-    for row in summary:
-        scale = scale_of(row["mean"], row["sd"])
-        power = f" e{scale.exponent:+03d}" if scale.exponent else ""
-        cells = [scale.number(row["MAP"]) + power, with_error(row["mean"], row["sd"])]
-        if with_truth:
-            cells = [scale.number(row["truth"]) + power, *cells, f"{row['z']:+.2f}"]
-        table.add_row(
-            row["name"],
-            *cells,
-            with_error(row["corner"], row["corner_sd"]),
-            f"{row['rhat']:.3f}",
-            f"{min(row['ess_bulk'], row['ess_tail']):.0f}",
-            f"{row['prior_sensitivity']:.3f}",
-        )
-    return table
+    scales = [scale_of(row["mean"], row["sd"]) for row in summary]
+    powers = [f" e{scale.exponent:+03d}" if scale.exponent else "" for scale in scales]
+
+    def values(key: str) -> list[str]:
+        if key not in summary.colnames:
+            return []
+        shown = zip(scales, summary[key], powers, strict=True)
+        return [scale.number(value) + power for scale, value, power in shown]
+
+    def numbers(key: str, form: str) -> list[str]:
+        if key not in summary.colnames:
+            return []
+        return [format(value, form) if np.isfinite(value) else "" for value in summary[key]]
+
+    means = [with_error(row["mean"], row["sd"]) for row in summary]
+    corners = [with_error(row["corner"], row["corner_sd"]) for row in summary]
+    least = np.minimum(summary["ess_bulk"], summary["ess_tail"])
+    columns = [
+        _Column("parameter", [str(name) for name in summary["name"]], justify="left"),
+        _Column("truth", values("truth"), 4),
+        _Column("MAP", values("MAP"), 6),
+        _Column("posterior mean +- sd", means),
+        _Column("z", numbers("z", "+.2f"), 2),
+        _Column("px at corner", corners, 1),
+        _Column("R-hat", numbers("rhat", ".3f"), 5),
+        _Column("ESS", [f"{ess:.0f}" if np.isfinite(ess) else "" for ess in least], 3),
+        _Column("prior", numbers("prior_sensitivity", ".3f"), 7),
+    ]
+    return _table([column for column in columns if any(column.cells)], width)
 
 
-def study_table(result: NoiseStudy | PosteriorCalibration) -> Table:
+def study_table(result: NoiseStudy | PosteriorCalibration, width: int) -> Table:
     """Lay out a study's findings: a row for each noise level, or for each quantity.
 
     Parameters
     ----------
     result : NoiseStudy or PosteriorCalibration
+    width : int
+        Characters in a line. Where they do not suffice, columns are left out: lambda first, then
+        chi2, the coverage of 68 %, pull and efficiency.
 
     Returns
     -------
@@ -79,18 +105,15 @@ def study_table(result: NoiseStudy | PosteriorCalibration) -> Table:
         rows = {key: values[whole] for key, values in result.cells.items()}
         heads = [name for name in VARIABLES if len(set(rows[name])) > 1] or ["background"]
         heads += ["frames", "failed"]
-        shown = ["displacement_rms", "displacement_predicted", "photons"]
-        shown += ["efficiency", "coverage_68", "coverage_95"]
+        shown = {"displacement_rms": 0, "displacement_predicted": 2, "photons": 1}
+        shown |= {"efficiency": 3, "coverage_68": 5, "coverage_95": 4}
     else:
         rows, heads = result.quantities, ["quantity"]
-        shown = ["coverage_68", "coverage_95", "pull", "uniformity"]
+        shown = {"coverage_68": 3, "coverage_95": 0, "pull": 2, "uniformity": 0}
     names = {
         "coverage_68": "% in 68 %", "coverage_95": "% in 95 %",
         "displacement_rms": "rms error / px", "displacement_predicted": "predicted",
     }  # fmt: skip
-    table = Table()
-    for head in (*heads, *shown):
-        table.add_column(names.get(head, head), justify="right", no_wrap=True)
 
     def cell(key: str, k: int) -> str:
         value = rows[key][k]
@@ -104,11 +127,15 @@ def study_table(result: NoiseStudy | PosteriorCalibration) -> Table:
         factor, digits = (100.0, 1) if "coverage" in key else (1.0, 2)
         if key == "displacement_rms" and error > 0.0:  # the error to one digit
             digits = max(0, -math.floor(math.log10(error)))
-        return f"{factor * value:.{digits}f} ± {factor * error:.{digits}f}"
+        return f"{factor * value:.{digits}f} +- {factor * error:.{digits}f}"
 
-    for k in range(len(rows[heads[0]])):
-        table.add_row(*(cell(key, k) for key in (*heads, *shown)))
-    return table
+    return _table(
+        [
+            _Column(names.get(key, key), [cell(key, k) for k in range(len(rows[key]))], gives_way)
+            for key, gives_way in (dict.fromkeys(heads, 0) | shown).items()
+        ],
+        width,
+    )
 
 
 def check_table(checks: Iterable[Check]) -> Table:
@@ -128,63 +155,95 @@ def check_table(checks: Iterable[Check]) -> Table:
     return table
 
 
-def comparison_table(compared: Comparison) -> Table:
+def comparison_table(compared: Comparison, width: int) -> Table:
     """Lay out a ranking of models.
 
     Parameters
     ----------
     compared : Comparison
+    width : int
+        Characters in a line. Where they do not suffice, columns are left out: p_loo first, then
+        Pareto k, elpd and the number of parameters.
 
     Returns
     -------
     rich.table.Table
     """
-    table = Table("model", "parameters", "elpd", "p_loo", "behind the best", "Pareto k")
-    best = compared.scores[0]
-    for score in compared.scores:
-        behind = f"{score.difference:.1f} +- {score.difference_se:.1f}"
-        table.add_row(
-            escape(printable(score.name)),
-            str(score.n_parameters),
-            f"{score.elpd:.1f} +- {score.elpd_se:.1f}",
-            f"{score.p_loo:.1f}",
-            "" if score is best else behind,
-            f"{score.pareto_k:.2f}" if np.isfinite(score.pareto_k) else "",
-        )
-    return table
+    scores = compared.scores
+    return _table(
+        [
+            _Column("model", [escape(printable(s.name)) for s in scores], justify="left"),
+            _Column("parameters", [str(s.n_parameters) for s in scores], 1),
+            _Column("elpd", [f"{s.elpd:.1f} +- {s.elpd_se:.1f}" for s in scores], 2),
+            _Column("p_loo", [f"{s.p_loo:.1f}" for s in scores], 4),
+            _Column(
+                "behind the best",
+                ["", *(f"{s.difference:.1f} +- {s.difference_se:.1f}" for s in scores[1:])],
+            ),
+            _Column(
+                "Pareto k",
+                [f"{s.pareto_k:.2f}" if np.isfinite(s.pareto_k) else "" for s in scores],
+                3,
+            ),
+        ],
+        width,
+    )
 
 
-def cross_check_table(found: CrossCheck) -> Table:
+def cross_check_table(found: CrossCheck, width: int) -> Table:
     """Lay out how well two halves agree.
 
     Parameters
     ----------
     found : CrossCheck
+    width : int
+        Characters in a line.
 
     Returns
     -------
     rich.table.Table
     """
-    table = _table("halves agree in", "chi2", "dof", "p", "errors times", "found from")
     rows = {
         "displacement": found.displacement,
         "coefficients": found.coefficients,
         "positions, half 1": found.positions[0],
         "positions, half 2": found.positions[1],
     }
-    for name, a in rows.items():
-        low, high = a.factor_interval
-        scaling = f"{a.factor:.2f} ({low:.2f}-{high:.2f})"
-        table.add_row(
-            name, f"{a.chi2:.1f}", str(a.dof), f"{a.p:.2g}", scaling, f"{a.detectable:.2f}"
-        )
-    return table
+    scaling = [
+        f"{a.factor:.2f} ({a.factor_interval[0]:.2f}-{a.factor_interval[1]:.2f})"
+        for a in rows.values()
+    ]
+    return _table(
+        [
+            _Column("halves agree in", list(rows), justify="left"),
+            _Column("chi2", [f"{a.chi2:.1f}" for a in rows.values()], 2),
+            _Column("dof", [str(a.dof) for a in rows.values()], 3),
+            _Column("p", [f"{a.p:.2g}" for a in rows.values()]),
+            _Column("errors times", scaling),
+            _Column("found from", [f"{a.detectable:.2f}" for a in rows.values()], 1),
+        ],
+        width,
+    )
 
 
-def _table(first: str, *heads: str) -> Table:
-    """A table whose first column is a text and whose others are numbers."""
+def _table(columns: Sequence[_Column], width: int) -> Table:
+    """A table of the columns that fit; the first one is folded where it alone is too wide."""
+    kept = list(columns)
+
+    def needed() -> int:
+        return 1 + sum(3 + max(len(text) for text in (c.head, *c.cells)) for c in kept)
+
+    while needed() > width and (least := max(kept, key=lambda c: c.gives_way)).gives_way:
+        kept.remove(least)
     table = Table()
-    table.add_column(first, no_wrap=True)
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
+    for column in kept:
+        first = column is kept[0]
+        table.add_column(
+            column.head,
+            justify=column.justify,
+            no_wrap=not first,
+            overflow="fold" if first else "crop",
+        )
+    for row in zip(*(column.cells for column in kept), strict=True):
+        table.add_row(*row)
     return table

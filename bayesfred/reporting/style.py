@@ -66,7 +66,7 @@ class Embedded(NamedTuple):
 def embedded(figure: Figure) -> Embedded:
     """Render a figure as an image within a page.
 
-    It has 256 colours, which makes it a third of a PNG of all colours.
+    It has 256 colours, which makes it a third as large as one of all colours.
 
     Parameters
     ----------
@@ -84,11 +84,8 @@ def embedded(figure: Figure) -> Embedded:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="rgba", dpi="figure", facecolor="white")
     image = Image.frombytes("RGBA", figure.canvas.get_width_height(), buffer.getvalue())
-    few = image.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    palette, corner = few.getpalette() or [], few.getpixel((0, 0))
-    if isinstance(corner, int):  # the background, which is nearly white now
-        palette[3 * corner : 3 * corner + 3] = (255, 255, 255)
-        few.putpalette(palette)
+    # of Pillow's methods the one that keeps rare colours, such as those at a scale's ends
+    few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     few.save(buffer, "png", optimize=True)
     uri = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -34,8 +34,9 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import write_chain
 from bayesfred.sampling.moves import LaplaceMove
+from bayesfred.sampling.progress import searching
 from bayesfred.sampling.record import RunRecord
-from bayesfred.sampling.sampler import check_estimate, check_output, searching, versions
+from bayesfred.sampling.sampler import check_estimate, check_output, versions
 
 __all__ = ["importance_efficiency", "laplace"]
 
@@ -71,7 +72,7 @@ def laplace(
     overwrite : bool
         Replace the file.
     progress : bool
-        Say on standard error that the maximum is being searched for.
+        Say in a terminal that the maximum is being searched for.
     record : RunRecord, optional
         Title, frame, settings, notes and truth, kept with the draws.
 

@@ -128,7 +128,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         for any scatter about a fit). Given tau_k the other parameters have their Laplace
         approximation, one Newton step from the estimate. The k-th weight is proportional to the
         posterior there times the root of the determinant of the covariance, in which the variance
-        of tau is the squared distance between the tau_k.
+        of tau is the squared distance between the tau_k; a quarter of it without a heavy share.
 
         Raises
         ------
@@ -155,6 +155,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         j = posterior.parameter_names.index(posterior.hyperparameters[0])
         rest = np.arange(estimate.params.size) != j
         ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
+        # a proposal may be too wide in tau; without its heavy share it stands for the posterior
+        width = 1.0 if heavy_share else 0.5
         means, covariances = [], []
         logs: list[float] = []
         for outward in (range(NESTED), range(-1, -NESTED, -1)):
@@ -165,7 +167,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
                     posterior.information(mean)[np.ix_(rest, rest)]
                 )
                 mean += covariance @ posterior.gradient(mean)
-                covariance[j, j] = (ratio * mean[j]) ** 2
+                covariance[j, j] = (ratio * mean[j] * width) ** 2
                 log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(covariance)[1]
                 if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
                     break

@@ -10,16 +10,13 @@ half minute and at the end, so that a run that was stopped can be resumed.
 
 import math
 import platform
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.status import Status
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats, PathLike
@@ -33,10 +30,11 @@ from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import changed_parts, fingerprint, open_chain, write_chain
 from bayesfred.sampling.checkpoints import Checkpoints, in_memory
 from bayesfred.sampling.ensembles import Step, adapted, advance, begin, check_start
+from bayesfred.sampling.progress import progress_bar, searching
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.stopping import burn_in, checks, sufficient
 
-__all__ = ["Run", "check_estimate", "check_output", "sample", "searching", "versions"]
+__all__ = ["Run", "check_estimate", "check_output", "sample", "versions"]
 
 MOST_STEPS = 100_000
 PACKAGES = ("bayesfred", "emcee", "numba", "numpy", "scipy")
@@ -84,7 +82,7 @@ def sample(
     overwrite : bool
         Replace the file.
     progress : bool
-        Show a progress bar on standard error.
+        Show progress on standard error: a bar in a terminal, a line every half minute elsewhere.
     record : RunRecord, optional
         What the chain keeps of the run beside its draws; a resumed run keeps the one it has unless
         another is given.
@@ -175,13 +173,6 @@ def check_estimate(posterior: TargetDensity, estimate: MapEstimate) -> None:
             f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
             "this posterior's maximum"
         )
-
-
-def searching() -> Status:
-    """Says on the screen, within its `with` block, that the maximum is being searched for."""
-    return Console(stderr=True).status(
-        "searching for the maximum (the first run on a machine compiles: half a minute)"
-    )
 
 
 def versions() -> dict[str, str]:
@@ -275,9 +266,11 @@ class Run:
         Whatever ends the run, its steps are saved first.
         """
         try:
-            with _bar(steps, show) as update:
+            with progress_bar("sampling", show=show) as update:
                 for share in self._advance(target_ess, steps):
-                    update(len(self.steps), share)
+                    n = len(self.steps)
+                    total = steps or max(n + 1, math.ceil(n / max(share, 0.05)))
+                    update(n, total, f"{n} steps")
                     if checkpoints.due():
                         checkpoints.save(self._chain(target_ess))
             chain = self._chain(target_ess)
@@ -328,23 +321,3 @@ class Run:
             n_invalid=last.n_invalid,
             record=self.record,
         )
-
-
-@contextmanager
-def _bar(steps: int | None, show: bool) -> Iterator[Callable[[int, float], None]]:
-    """A progress bar that is told the number of steps and the share of what is wanted."""
-    columns = (
-        TextColumn("sampling"),
-        BarColumn(),
-        TextColumn("{task.fields[state]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=not show) as bar:
-        task = bar.add_task("", total=steps, state="")
-
-        def update(n: int, share: float) -> None:
-            total = steps or max(n + 1, math.ceil(n / max(share, 0.05)))
-            bar.update(task, completed=n, total=total, state=f"{n} steps")
-
-        yield update

@@ -59,10 +59,10 @@ def find_causes(posterior: Posterior, params: Floats) -> tuple[Cause, ...]:
             findings += [fluxes(context), psf(context), *single_sources(context)]
     else:
         findings += [unmatched(context), *background_and_noise(context)]
-    return _ranked([f for f in findings if f is not None], total)
+    return ranked([f for f in findings if f is not None], total)
 
 
-def _ranked(findings: list[Finding], total: float) -> tuple[Cause, ...]:
+def ranked(findings: list[Finding], total: float) -> tuple[Cause, ...]:
     """Causes by what they explain, each with a share that none before has claimed."""
     rest = list(findings)
     left = 1.0

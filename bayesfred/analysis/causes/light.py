@@ -35,14 +35,14 @@ def fluxes(context: Context) -> Finding | None:
     if common >= ENOUGH * own:
         cause = Cause(
             "fluxes", 0.0, f"all sources have {1.0 + factor:.3g} times the model's light",
-            'set flux = "scale" in [nuisances]',
+            'set nuisances.flux = "scale"',
         )  # fmt: skip
         return Finding(cause, common, "light")
     scatter = float(np.sqrt(np.median(off**2)) / 0.6745)
     cause = Cause(
         "fluxes", 0.0,
         f"the sources have other fluxes than the catalogue's, by {scatter:.1%} (68 % of them)",
-        'set flux = "free" in [nuisances]',
+        'set nuisances.flux = "free"',
     )  # fmt: skip
     return Finding(cause, own, "light", RICHER)
 
@@ -71,7 +71,7 @@ def single_sources(context: Context) -> Iterator[Finding]:
             "wrong sources", 0.0,
             f"{wrong.sum()} of {light.inside.sum()} sources hold the misfit{dim}: rows of the "
             f"catalogue, from 0: {names}{more}",
-            "correct their positions and fluxes, or set reject_outliers = true",
+            "correct their positions and fluxes, or set frame.reject_outliers = true",
         )  # fmt: skip
         explained = float(own.sum() + found.power[near].sum())
         yield Finding(cause, explained, "position")
@@ -82,7 +82,7 @@ def single_sources(context: Context) -> Iterator[Finding]:
             "uncatalogued sources", 0.0,
             f"{rest.size} detections belong to no source of the catalogue, the brightest at "
             f"u, v = {at}",
-            "set reject_outliers = true, or footprint, or complete the catalogue",
+            "set frame.reject_outliers = true, or footprint, or complete the catalogue",
         )  # fmt: skip
         yield Finding(cause, float(rest.sum()), "position")
 
@@ -141,7 +141,7 @@ def _shape(context: Context, explained: float, profile: Floats) -> Finding | Non
         f"around the sources the counts have {side} light than the PSF, by "
         f"{abs(profile[worst]) / peak:.2%} of its peak at {ring:.1f} pixels{also}",
         'fit another PSF: kind = "moffat" or "sampled", pixel = "box" for a narrow one' if mode
-        else "set psf_sigma = true, or fit another PSF",
+        else "set nuisances.psf_sigma = true, or fit another PSF",
     )  # fmt: skip
     return Finding(cause, explained, "light", RICHER)
 

@@ -67,7 +67,7 @@ def saturation(context: Context) -> tuple[Finding | None, Flags]:
         "saturation", 0.0,
         f"{full.sum()} pixels at {touched.sum()} sources hold the frame's largest value, {top:g} "
         f"counts, such as row {row}, column {column}: they are saturated",
-        "mask them: give [frame] saturation",
+        "mask them: set frame.saturation",
     )  # fmt: skip
     return Finding(cause, explained, "saturation"), np.asarray(spoiled & context.posterior.mask)
 
@@ -131,7 +131,7 @@ def _background(
         "background", 0.0,
         f"the background between the sources differs from the model's by up to {by:.2g} counts a "
         "pixel from one part of the frame to another",
-        f"set background_order = {2 if order or len(mean) > 20 else 1}" if mends else
+        f"set nuisances.background_order = {2 if order or len(mean) > 20 else 1}" if mends else
         "subtract a background first, or mask what is not background",
     )  # fmt: skip
     yield Finding(cause, held * everywhere, "background")
@@ -183,14 +183,14 @@ def _finding_of_noise(context: Context, name: str, ratio: float, growth: Floats)
     if name == "gain":
         unit = "less" if ratio < 1.0 else "more"
         sentence = f"{found}, and at the sources, too: one count is {unit} than one photon"
-        remedy = f"check [frame] gain: {1.0 / ratio:.3g} times the present one would cure it"
+        remedy = f"check frame.gain: {1.0 / ratio:.3g} times the present one would cure it"
     elif name == "read noise":
         sentence = f"{found}, and at bright sources with less: some variance is constant"
         known = getattr(context.posterior.noise, "shift", 0.0)
-        remedy = f"set [noise] read_noise to about {(variance + known) ** 0.5:.3g}"
+        remedy = f"set noise.read_noise to about {(variance + known) ** 0.5:.3g}"
     elif name == "pedestal":
         sentence = f"{found}, and at bright sources with more: {variance:.3g} counts are no photons"
-        remedy = f"check [frame] pedestal, {variance:.3g} counts more, or a smaller read_noise"
+        remedy = f"check frame.pedestal, {variance:.3g} counts more, or a smaller read_noise"
     else:
         sentence = f"{found}, and at bright sources with more: the noise is not the photons' alone"
         remedy = "check the flat field and the variance of the noise model"

@@ -171,7 +171,7 @@ def _patterns(context: Context, measured: Displaced, how: str = "") -> Finding |
         cause = Cause(
             name, 0.0, f"{how}all sources are shifted by {u:+.3g}, {v:+.3g} pixels",
             "widen the prior of offset_x and offset_y" if context.posterior.nuisances.offset
-            else "set offset = true in [nuisances]",
+            else "set nuisances.offset = true",
         )  # fmt: skip
     elif name == "rotation or scale":
         cause = Cause(

@@ -20,7 +20,7 @@ MOST_SOURCES, MOST_PEAKS = 80, 160  # that vote
 COARSE = 0.02  # of the frame's side: how far a lens may move what votes for one place
 FEWEST = 6  # sources that have to be found
 MORE = 1.2  # times as many votes as the catalogue as it is, or it stays as it is
-ANGLES, SCALES = np.arange(0.0, 360.0, 3.0), np.geomspace(0.8, 1.25, 9)
+ANGLES, SCALES = np.arange(0.0, 360.0, 4.0), np.geomspace(0.8, 1.25, 7)
 CUBIC_FROM = 16  # pairs
 TURNS = 8
 

@@ -1,0 +1,189 @@
+"""The verdict in words: does the model fit, is the posterior sampled, what do errors leave out.
+
+There are three sentences, in order of loudness: a model that does not fit spoils every other
+number, and says so first, with the probable cause and what to do. All places that show the verdict
+show these sentences: the page, the terminal, tables and JSON.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesfred._typing import Floats
+from bayesfred.analysis.causes import Cause, find_causes
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
+from bayesfred.optimize.matched import enough_matched, source_light
+from bayesfred.sampling.chain import Chain
+
+__all__ = ["MIN_EFFICIENCY", "FitVerdict", "judge_approximation", "judge_fit", "judge_sampling"]
+
+MAX_RHAT = 1.01
+MIN_ACCEPTANCE = 0.1
+MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
+WIDER = 1.1  # factor of the errors from which it is said
+
+
+@dataclass(frozen=True)
+class FitVerdict:
+    """Whether a model fits the counts, and why not.
+
+    Attributes
+    ----------
+    fits_data : bool
+    causes : tuple of Cause
+        The most likely first; empty where the model fits.
+    sentence : str
+        How well it fits, or how badly, probably why and what to do.
+    omitted : str
+        What the error bars leave out.
+    """
+
+    fits_data: bool
+    causes: tuple[Cause, ...]
+    sentence: str
+    omitted: str
+
+
+def judge_fit(posterior: Any, params: Floats, fit: Mapping[str, float]) -> FitVerdict:
+    """Judge whether a model fits the counts at its maximum.
+
+    It does where deviance and Pearson's statistic are within 5 standard deviations of their
+    expectations, and enough sources are matched, see `bayesfred.optimize.matched`.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of another density with counts only the sums are judged.
+    params : ndarray, shape (d,)
+    fit : mapping of str to float
+        See `fit_statistics`.
+
+    Returns
+    -------
+    FitVerdict
+    """
+    fits, causes, matched = consistent(fit), tuple[Cause, ...](), ""
+    if isinstance(posterior, Posterior):
+        light = source_light(posterior, params)
+        enough = enough_matched(posterior, light)
+        matched = f", {light.matched.sum()} of {len(light.matched)} sources matched"
+        fits = fits and enough
+        if not fits:
+            causes = find_causes(posterior, params)
+    sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
+    sums = f"{sums} expectation{matched}"
+    if fits:
+        sentence = f"The model fits the counts: {sums}."
+    else:
+        sentence = f"The model does not fit the counts: {sums} (at most {CONSISTENT:.0f} are "
+        sentence += f"expected). {_why(causes)}"
+    return FitVerdict(fits, causes, sentence, _omitted(posterior, fit, fits))
+
+
+def judge_sampling(
+    chain: Chain, rhat: Floats, ess: Floats, acceptance: float, target_ess: float
+) -> tuple[bool, str]:
+    """Judge how a chain is sampled.
+
+    Parameters
+    ----------
+    chain : Chain
+    rhat, ess : ndarray, shape (d,)
+        Of every parameter; the smaller of its two effective sample sizes.
+    acceptance : float
+    target_ess : float
+
+    Returns
+    -------
+    well : bool
+    sentence : str
+        All criteria, or those that fail.
+    """
+    names = chain.parameter_names
+    worst, least = int(np.argmax(rhat)), int(np.argmin(ess))
+    failures = []
+    if not rhat[worst] <= MAX_RHAT:
+        failures.append(f"R-hat {rhat[worst]:.3f} of {names[worst]} exceeds {MAX_RHAT}")
+    if not ess[least] >= target_ess:
+        failures.append(
+            f"effective sample size {ess[least]:.0f} of {names[least]} is below {target_ess:.0f}"
+        )
+    if not acceptance >= MIN_ACCEPTANCE:
+        failures.append(f"acceptance {acceptance:.1%} is below {MIN_ACCEPTANCE:.0%}")
+    failures += _not_at_maximum(chain)
+    if failures:
+        return False, f"Not sampled well: {'; '.join(failures)}."
+    return True, (
+        f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
+        f"{ess.min():.0f}, acceptance {acceptance:.1%}."
+    )
+
+
+def judge_approximation(chain: Chain, efficiency: float) -> str:
+    """Say whether the draws of a Laplace approximation represent the posterior.
+
+    Parameters
+    ----------
+    chain : Chain
+    efficiency : float
+        See `bayesfred.sampling.laplace.importance_efficiency`.
+
+    Returns
+    -------
+    str
+    """
+    failures = _not_at_maximum(chain)
+    if not efficiency >= MIN_EFFICIENCY:
+        failures.append(
+            f"the posterior is not normal (importance efficiency {efficiency:.0%} is below "
+            f"{MIN_EFFICIENCY:.0%}): sample it"
+        )
+    if failures:
+        wrong = "; ".join(failures)
+        return f"Not sampled, and errors of the Laplace approximation do not hold: {wrong}."
+    return (
+        "Not sampled: errors are those of the information at the maximum (importance efficiency "
+        f"{efficiency:.0%})."
+    )
+
+
+def _not_at_maximum(chain: Chain) -> list[str]:
+    if chain.estimate.at_maximum:
+        return []
+    return [f"the MAP is not at the maximum ({chain.estimate.message})"]
+
+
+def _sum(fit: Mapping[str, float], name: str) -> str:
+    excess = misfit(fit, name)
+    side = "below" if excess < 0.0 else "above"
+    head = "deviance" if name == "deviance" else "Pearson's statistic"
+    return f"{head} {abs(excess):.1f} standard deviations {side}"
+
+
+def _why(causes: tuple[Cause, ...]) -> str:
+    """The first cause with what to do, and the names of the others."""
+    if not causes:
+        return "No cause was found: look at the residuals."
+    first, *others = causes
+    more = ", ".join(f"{cause.name} ({cause.share:.0%})" for cause in others)
+    also = f" Further causes: {more}." if more else ""
+    return (
+        f"Probable cause: {first.name} ({first.share:.0%} of the misfit): {first.sentence}. "
+        f"Remedy: {first.remedy}.{also}"
+    )
+
+
+def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
+    """What the error bars leave out."""
+    nuisances = posterior.nuisances
+    left_out = [] if nuisances.position_scatter else ["the catalogue's positions"]
+    left_out += ["its fluxes"] if nuisances.flux == "fixed" else []
+    left_out += ["the PSF's shape" if nuisances.psf_sigma else "the PSF", "the choice of terms"]
+    sentence = f"The error bars leave out errors of {', '.join(left_out[:-1])} and {left_out[-1]}"
+    factor = (max(fit["pearson"], 0.0) / max(fit["pearson_expected"], 1.0)) ** 0.5
+    if fits or not WIDER < factor < np.inf:
+        return f"{sentence}{'' if fits else ', and the misfit'}."
+    return f"{sentence}, and the misfit: as mere noise it would make them {factor:.2g} times wider."

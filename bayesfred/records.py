@@ -1,0 +1,110 @@
+"""The records that commands return."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bayesfred._typing import Floats
+from bayesfred.analysis.comparison import Comparison
+from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.analysis.field import DisplacementField
+from bayesfred.analysis.noise_study import NoiseStudy
+from bayesfred.analysis.photons import PhotonsNeeded
+from bayesfred.analysis.sbc import PosteriorCalibration
+from bayesfred.io.summary_table import Table
+from bayesfred.model.posterior import Posterior
+from bayesfred.sampling.chain import Chain
+
+__all__ = ["Compared", "Result", "Simulated", "Study"]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a finished run left.
+
+    Attributes
+    ----------
+    chain : Chain
+    diagnostics : Diagnostics
+    field : DisplacementField
+        How far the frame displaces its objects, and how well that is known.
+    summary : astropy.table.Table
+        The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
+    path, page, picture, sources : Path
+        The files: the chain, its report, its picture and its table of sources.
+    photons : PhotonsNeeded, optional
+        What a smaller error would take, where that was asked.
+    """
+
+    chain: Chain
+    diagnostics: Diagnostics
+    field: DisplacementField
+    summary: Table
+    path: Path
+    page: Path
+    picture: Path
+    sources: Path
+    photons: PhotonsNeeded | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """A simulated frame.
+
+    Attributes
+    ----------
+    posterior : Posterior
+        Its `counts` are the frame.
+    truth : ndarray, shape (d,), parameter units
+    frame : Path
+        The frame's file.
+    catalogue : Path or None
+        The file of the sources, if they were made with the frame.
+    """
+
+    posterior: Posterior
+    truth: Floats
+    frame: Path
+    catalogue: Path | None
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What a study found and where it is.
+
+    Attributes
+    ----------
+    result : NoiseStudy or PosteriorCalibration
+    table, summary, picture : Path
+        The files: a row for each frame, the findings, their figure.
+    """
+
+    result: NoiseStudy | PosteriorCalibration
+    table: Path
+    summary: Path
+    picture: Path
+
+    @property
+    def holds(self) -> bool:
+        """Whether every frame could be fitted or, in a calibration, the error bars hold."""
+        if isinstance(self.result, PosteriorCalibration):
+            return self.result.calibrated
+        return not self.result.cells["failed"].any()
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Runs side by side.
+
+    Attributes
+    ----------
+    ranking : Comparison or None
+        How well their models predict; None where they cannot be ranked.
+    reason : str
+        Why they cannot.
+    page : Path or None
+        The page, where one was asked for.
+    """
+
+    ranking: Comparison | None
+    reason: str
+    page: Path | None

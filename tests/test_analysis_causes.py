@@ -1,0 +1,183 @@
+"""Causes of a misfit: planted faults are named first, a true model has none, the sums are right."""
+
+from typing import Any
+
+import numpy as np
+import planted
+import pytest
+
+from bayesfred.analysis.causes import Cause, find_causes
+from bayesfred.analysis.causes.cause import Finding
+from bayesfred.analysis.causes.context import Context
+from bayesfred.analysis.causes.find import ranked
+from bayesfred.analysis.causes.pixels import full_pixels
+from bayesfred.analysis.verdict import judge_fit
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.noise import BackgroundNoise, GaussianNoise
+from bayesfred.model.parameters import Nuisances
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.fit_statistics import fit_statistics
+
+FRAMES = 50
+
+
+def judged(posterior: Posterior) -> Any:
+    """The verdict on the fit at the maximum."""
+    params = find_map(posterior).params
+    return judge_fit(posterior, params, fit_statistics(posterior, params))
+
+
+def named_first(name: str, seeds: range) -> int:
+    """In how many frames the planted fault is the first cause."""
+    plant, right = planted.FAULTS[name]
+    hits = 0
+    for seed in seeds:
+        verdict = judged(plant(seed))
+        assert not verdict.fits_data
+        hits += bool(verdict.causes) and verdict.causes[0].name in right
+    return hits
+
+
+@pytest.mark.parametrize("name", planted.FAULTS)
+def test_planted_fault_is_named_first(name: str) -> None:
+    assert named_first(name, range(101, 103)) == 2
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize("name", planted.FAULTS)
+def test_planted_fault_is_named_first_in_nine_of_ten_frames(
+    name: str, record_property: Any
+) -> None:
+    """Of 50 frames; a rate of 0.9 has a binomial error of 0.04."""
+    hits = named_first(name, range(1, FRAMES + 1))
+    record_property("named first, of 50", hits)
+    assert hits >= 0.9 * FRAMES
+
+
+def test_a_true_model_has_no_cause() -> None:
+    for seed in (1, 2, 3):
+        for nuisances in ({}, {"flux": "free", "offset": True, "psf_sigma": True}):
+            verdict = judged(planted.true(seed, **nuisances))
+            assert verdict.fits_data and verdict.causes == ()
+            assert verdict.sentence.startswith("The model fits the counts: deviance ")
+
+
+@pytest.mark.statistics
+def test_true_models_fit_in_all_frames() -> None:
+    """Two sums beyond 5 standard deviations are one in a million of normal ones."""
+    assert all(judged(planted.true(seed)).fits_data for seed in range(1, FRAMES + 1))
+
+
+def test_the_wrong_cause_is_not_named() -> None:
+    """The negative control of the tests above: a fault is not found where another is planted."""
+    plant, _ = planted.FAULTS["read noise"]
+    planted_names = {right[0] for _, right in planted.FAULTS.values()} - {"read noise"}
+    names = {cause.name for cause in judged(plant(101)).causes}
+    assert names == {"read noise"} and not names & planted_names
+
+
+def test_numbers_in_the_sentences_are_those_planted() -> None:
+    causes = {name: judged(planted.FAULTS[name][0](7)).causes[0] for name in
+              ("gain", "read noise", "pedestal", "shift", "rotation by 25 degrees", "origin",
+               "a factor of all fluxes")}  # fmt: skip
+
+    def number(name: str, after: str, text: str = "sentence") -> float:
+        words = getattr(causes[name], text).split(after)[1].split()
+        return float(words[0].strip(",;:"))
+
+    assert number("gain", "gain: ", "remedy") == pytest.approx(4.0, rel=0.05)
+    assert number("read noise", "about ", "remedy") == pytest.approx(8.0, rel=0.05)
+    assert number("pedestal", "more: ") == pytest.approx(60.0, rel=0.05)
+    assert number("shift", "shifted by ") == pytest.approx(2.5, abs=0.5)
+    assert number("rotation by 25 degrees", "rotated by ") == pytest.approx(25.0, abs=1.0)
+    assert number("origin", "shifted by ") == pytest.approx(-planted.HALF, abs=5.0)
+    assert number("a factor of all fluxes", "sources have ") == pytest.approx(1.6, rel=0.05)
+    assert "nuisances.offset = true" in causes["shift"].remedy
+
+
+def test_excess_of_a_displaced_source_is_what_the_derivation_says() -> None:
+    """(q + q') (1 - exp(-e^2 / 4 s^2)) against images, where the background makes the noise."""
+    s, e = 2.0, 1.7
+    bright = {"detector": Detector((61, 61)), "psf": GaussianPSF(s), "distortion": planted.LENS}
+    here = ForwardModel(sources=SourceCatalog([0.0], [0.0], [100.0]), **bright)
+    there = ForwardModel(sources=SourceCatalog([e], [0.0], [100.0]), **bright)
+    images = [model.expected_counts(np.zeros(4)) for model in (here, there)]
+    excess = np.sum((images[0] - images[1]) ** 2)
+    q = np.sum(images[0] ** 2)
+    assert excess == pytest.approx(2.0 * q * -np.expm1(-(e**2) / (4.0 * s**2)), rel=1e-6)
+
+
+def test_power_of_the_catalogue_is_the_integral() -> None:
+    posterior = planted.true(5)
+    context = Context(posterior, np.append(planted.THETA, planted.LEVEL), ~posterior.mask)
+    image = planted.camera(posterior.model.sources).expected_counts(planted.THETA)
+    assert context.power.sum() == pytest.approx(np.sum(image**2 / (image + 20.0)), rel=0.02)
+    assert context.catalogue_power.sum() == pytest.approx(context.power.sum(), rel=0.05)
+    assert context.missing_power.sum() == pytest.approx(np.sum(image**2 / 20.0), rel=0.07)
+
+
+def test_equal_counts_of_faint_frames_are_no_pile() -> None:
+    rng = np.random.default_rng(1)
+    for level in (0.01, 1.0, 30.0):
+        posterior = Posterior(planted.camera(planted.field(1)), rng.poisson(level, (161, 161)))
+        params = np.append(planted.THETA, level)
+        assert not full_pixels(Context(posterior, params, ~posterior.mask))[0].any()
+
+
+def test_shares_are_claimed_once_and_the_simpler_hypothesis_leads() -> None:
+    def finding(name: str, explained: float, family: str, weight: float = 1.0) -> Finding:
+        return Finding(Cause(name, 0.0, name, name), explained, family, weight)
+
+    simple, rich = finding("simple", 90.0, "light"), finding("rich", 95.0, "light", 0.9)
+    other = finding("other", 30.0, "noise")
+    causes = ranked([rich, other, simple], 100.0)
+    assert [cause.name for cause in causes] == ["simple", "other"]
+    assert sum(cause.share for cause in causes) == pytest.approx(1.0)
+    richer = finding("rich", 120.0, "light", 0.9)
+    assert ranked([simple, richer], 130.0)[0].name == "rich"
+    assert ranked([], 100.0) == ()
+
+
+# --- frames of all kinds --------------------------------------------------------------------------
+
+
+def odd_frames() -> dict[str, Posterior]:
+    s, rng = planted.field(3), np.random.default_rng(3)
+    frame = planted.counts(planted.camera(s), 3)
+    one = SourceCatalog([3.0], [-2.0], [5e3])
+    narrow = ForwardModel(Detector((9, 41)), one, GaussianPSF(1.0), planted.LENS)
+    dark = np.zeros(planted.SHAPE)
+    holes = frame.copy()
+    holes[rng.random(planted.SHAPE) < 0.05] = np.nan
+    binned = ForwardModel(
+        Detector((80, 80), binning=2, pixel="box"), s, GaussianPSF(2.0), planted.LENS
+    )
+    return {
+        "one source on a strip": Posterior(narrow, rng.poisson(4.0, (9, 41)).astype(float) * 3.0),
+        "all zero": Posterior(planted.camera(s), dark),
+        "holes": Posterior(planted.camera(s), 2.0 * holes, mask=np.isfinite(holes)),
+        "binned": Posterior(binned, rng.poisson(9.0, (80, 80)).astype(float)),
+        "background noise": Posterior(planted.camera(s), 2.0 * frame, noise=BackgroundNoise()),
+        "gaussian noise": Posterior(planted.camera(s), frame, noise=GaussianNoise(9.0)),
+        "scatter": Posterior(
+            planted.camera(s), 3.0 * frame,
+            nuisances=Nuisances("free", position_scatter=True, background_order=2),
+        ),
+        "footprint": Posterior(
+            planted.camera(s), 3.0 * frame, nuisances=Nuisances("free", footprint=6.0)
+        ),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(odd_frames()))
+def test_causes_of_odd_frames_are_sentences(name: str) -> None:
+    posterior = odd_frames()[name]
+    params = np.append(np.zeros(4), posterior.start()[4:])
+    for cause in find_causes(posterior, params):
+        assert 0.0 < cause.share <= 1.0
+        text = f"{cause.sentence} {cause.remedy}"
+        assert text.isprintable() and "nan" not in text.split()
