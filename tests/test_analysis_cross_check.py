@@ -2,6 +2,8 @@
 wrong."""
 
 import json
+import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from typer.testing import CliRunner
 
+from bayesfred import commands
 from bayesfred.analysis.agreement import Agreement
 from bayesfred.analysis.cross_check import CrossCheck, cross_check
 from bayesfred.analysis.folds import fold_sources
@@ -333,3 +336,20 @@ def test_the_command_prints_the_verdict_and_exits_by_it(
     assert result.exit_code == code
     assert result.output.rstrip().splitlines()[-1].startswith("the errors are")
     assert max(map(len, result.output.split("displacements of")[0].splitlines())) <= 80
+
+
+STARS = Path(os.environ["BAYESFRED_DATA"], "startracker_alt60_azi45.fits")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not STARS.exists(), reason=f"no star tracker's frame {STARS}")
+@pytest.mark.parametrize(("scatter", "verdict"), [("false", "too small"), ("true", "right")])
+def test_halves_of_a_real_frame_agree_only_if_positions_scatter(
+    tmp_path: Path, scatter: str, verdict: str
+) -> None:
+    text = Path(__file__).parents[1].joinpath("examples/startracker.toml").read_text()
+    run = tmp_path / "run.toml"
+    run.write_text(
+        re.sub("^position_scatter = true", f"position_scatter = {scatter}", text, flags=re.M)
+    )
+    assert commands.crosscheck(run).verdict == verdict
