@@ -18,6 +18,7 @@ from .optimize.find_map import find_map, reject_outliers
 from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
 from .sampling.moves import LaplaceMove
+from .sampling.record import RunRecord
 from .sampling.sampler import sample
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "PolynomialDistortion",
     "Posterior",
     "PosteriorCalibration",
+    "RunRecord",
     "SampledPSF",
     "SourceCatalog",
     "calibrate_posterior",

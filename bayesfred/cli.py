@@ -32,6 +32,10 @@ ChainFile = Annotated[
     Path, typer.Argument(metavar="CHAIN.h5", help="A chain file.", show_default=False)
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="PAGE.html", help="The page.", show_default="beside the chain"),
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the output file.")]
 
 
@@ -126,9 +130,26 @@ def report(
             min=1, help="Effective draws to ask of every parameter.", show_default="the run's"
         ),
     ] = None,
+    corner: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,NAME,...",
+            help="Parameters to show in pairs.",
+            show_default="at most 12, of the most correlated pairs",
+        ),
+    ] = "",
+    out: Out = None,
+    overwrite: Overwrite = False,
 ) -> None:
-    """Judge a chain file again and write its report, .html and .png, beside it."""
-    _run(lambda: bf.show.show_run(bf.commands.report(chain_file, target_ess=target_ess)))
+    """Judge a chain file again and write its report, .html and .png."""
+    names = [name.strip() for name in corner.split(",") if name.strip()]
+    _run(
+        lambda: bf.show.show_run(
+            bf.commands.report(
+                chain_file, target_ess=target_ess, corner=names, out=out, overwrite=overwrite
+            )
+        )
+    )
 
 
 @app.command()

@@ -18,7 +18,7 @@ from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
 from bayesfred.errors import InputError
-from bayesfred.io import atomic, paths
+from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.io.tables import TableRecord, write_table
@@ -28,6 +28,7 @@ from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 
+_SEEDED = ("sampling", "simulation")
 DEMO_NOTE = (
     "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
     "PSF of 10 pixels. The coefficients are those of its Table 2, read with g in y and the columns "
@@ -62,10 +63,11 @@ def demo(
         If the folder cannot be created, or holds a demo already.
     """
     output = Path(folder, "demo.h5")
-    pipeline.make_folder(output)
+    outputs.make_folder(output)
     example = Path(__file__).with_name("example.toml")
     run = settings.read_settings(example)
-    run = run.model_copy(update={"sampling": run.sampling.model_copy(update={"seed": seed})})
+    seeded = {key: getattr(run, key).model_copy(update={"seed": seed}) for key in _SEEDED}
+    run = run.model_copy(update={**seeded, "study": None})
     posterior, truth = build.simulated(run, example, seed)
     job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
     return pipeline.fit_frame(job, posterior, overwrite=overwrite, say=say)
@@ -151,7 +153,7 @@ def fit(
         )
     posterior, estimate, notes = pipeline.read_frame(run, run_file, say)
     if run.output.path is None:
-        pipeline.make_folder(output)
+        outputs.make_folder(output)
     job = pipeline.Job(run, run_file, output, notes)
     return pipeline.fit_frame(job, posterior, estimate, resume=resume, overwrite=overwrite, say=say)
 
@@ -207,7 +209,7 @@ def study(
     else:
         posterior, truth = build.simulated(run, run_file, simulation.seed)
     if s.path is None:
-        pipeline.make_folder(table)
+        outputs.make_folder(table)
     with ExitStack() as stack:
         stack.enter_context(pipeline.naming(run_file))
         executor = stack.enter_context(cluster(scheduler)) if scheduler else None
@@ -236,14 +238,29 @@ def study(
     return Study(result, table, findings, picture)
 
 
-def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
-    """Judge a chain file again, and write its page and picture beside it.
+def report(
+    chain_file: PathLike,
+    *,
+    target_ess: float | None = None,
+    corner: Sequence[str] = (),
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> Result:
+    """Judge a chain file again, and write its page and picture.
 
     Parameters
     ----------
     chain_file : path-like
     target_ess : float, optional
         Effective draws to ask of every parameter; by default the number that the run was made for.
+    corner : sequence of str, optional
+        Parameters to show in pairs; by default all, or of more than twelve those of the most
+        correlated pairs.
+    out : path-like, optional
+        The page, .html; by default beside the chain. The picture, .png, and the table of sources,
+        .sources.ecsv, go beside the page.
+    overwrite : bool
+        Replace page, picture and table.
 
     Returns
     -------
@@ -252,16 +269,17 @@ def report(chain_file: PathLike, *, target_ess: float | None = None) -> Result:
     Raises
     ------
     InputError
-        If the chain is missing, damaged, or named as its page or picture would be.
+        If the chain is missing, damaged, or named as its page or picture would be; if a page,
+        picture or table exists, or `corner` names what is no parameter.
     """
     path = Path(chain_file)
     chain = open_chain(path)
-    if path in pipeline.beside(path):
-        raise InputError(
-            f"{path}: got a chain named as its report, which would replace it, expected "
-            "NAME.h5: rename it"
-        )
-    return pipeline.write_results(chain, path, target_ess=target_ess or chain.target_ess)
+    page, *others = outputs.beside(path if out is None else Path(out))
+    if out is not None:
+        page = Path(out)
+    outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
+    target = target_ess or chain.target_ess
+    return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
 
 
 def verify(chain_file: PathLike, *, every_draw: bool = False) -> Verification:

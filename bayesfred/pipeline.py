@@ -18,18 +18,22 @@ from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import PosteriorCalibration
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import InputError, printable
-from bayesfred.io import atomic, frames, paths
+from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import reject_outliers
+from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
-from bayesfred.reporting.html import page_figures, write_report
-from bayesfred.reporting.posteriors import overview
+from bayesfred.reporting.html import write_report
+from bayesfred.reporting.posteriors import corner_parameters, overview
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import open_chain
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import sample, searching
 from bayesfred.sampling.summary import summary
+from bayesfred.sections import toml
 
 __all__ = [
     "Job",
@@ -38,15 +42,20 @@ __all__ = [
     "Simulated",
     "Study",
     "Verification",
-    "beside",
     "fit_frame",
-    "make_folder",
     "naming",
     "read_frame",
     "write_results",
 ]
 
 Say = Callable[[str], None]
+
+SOURCES_META = {
+    "x, y": "catalogue position, fine pixel from the middle of the frame",
+    "u, v, du, dv, phase": "recorded pixel, u and v from the middle of the frame",
+    "flux, peak": "counts",
+    "columns": "see bayesfred.analysis.sources.source_table",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +68,8 @@ class Result:
     diagnostics : Diagnostics
     summary : astropy.table.Table
         The parameters, see `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
-    path, page, picture : Path
-        The files: the chain, its report and its picture.
+    path, page, picture, sources : Path
+        The files: the chain, its report, its picture and its table of sources.
     """
 
     chain: Chain
@@ -69,6 +78,7 @@ class Result:
     path: Path
     page: Path
     picture: Path
+    sources: Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +264,7 @@ def fit_frame(
         raise InputError(
             f"{output}: no folder {output.parent}, expected one to write the chain to: create it"
         )
-    others = beside(output)
+    others = outputs.beside(output)
     hidden = (output.with_name(f".{output.name}.{kind}") for kind in ("lock", "tmp", "writer"))
     for path in (output, *others, *hidden):
         if os.path.islink(path) or os.path.isdir(path):
@@ -265,10 +275,11 @@ def fit_frame(
     resume = paths.may_write(output, overwrite=overwrite, resume=resume, beside=others)
     try:
         with naming(job.run_file):
+            record = _record(job, open_chain(output) if resume else None)
             chain = sample(
                 posterior, estimate, path=output, seed=s.seed, ensembles=s.ensembles,
                 walkers=s.walkers, target_ess=s.target_ess, steps=s.steps, resume=resume,
-                overwrite=overwrite, progress=say is not None,
+                overwrite=overwrite, progress=say is not None, record=record,
             )  # fmt: skip
     except OSError as error:
         raise InputError(
@@ -277,21 +288,41 @@ def fit_frame(
         ) from error
     if say:
         say(f"maximum: {chain.estimate.message}")
-    return write_results(chain, output, job, target_ess=s.target_ess)
+    return write_results(chain, output, output, target_ess=s.target_ess)
 
 
-def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_ess: float) -> Result:
-    """Judge a chain, and write page and picture beside it.
+def _record(job: Job, before: Chain | None) -> RunRecord:
+    """What the chain keeps of a run; a resumed one has the seed and ensembles of its beginning."""
+    run = job.run
+    if before is not None:
+        ensembles, _, walkers, _ = before.chain.shape
+        used = {"seed": before.seed, "ensembles": ensembles, "walkers": walkers}
+        run = run.model_copy(update={"sampling": run.sampling.model_copy(update=used)})
+    return RunRecord(
+        printable(job.run_file.stem),
+        printable(Path(run.frame.path).name) if job.truth is None else "simulated frame",
+        toml(run),
+        tuple(job.notes),
+        job.truth,
+    )
+
+
+def write_results(
+    chain: Chain, path: Path, page: Path, *, target_ess: float, corner: Sequence[str] = ()
+) -> Result:
+    """Judge a chain, and write its page, picture and table of sources.
 
     Parameters
     ----------
     chain : Chain
     path : Path
         The chain's file.
-    job : Job, optional
-        The run that made the chain, if it is known.
+    page : Path
+        A file with the page's name but for the suffix.
     target_ess : float
         Effective draws to ask of every parameter.
+    corner : sequence of str, optional
+        Parameters to show in pairs; by default chosen.
 
     Returns
     -------
@@ -300,61 +331,27 @@ def write_results(chain: Chain, path: Path, job: Job | None = None, *, target_es
     Raises
     ------
     InputError
-        If page or picture cannot be written.
+        If a file cannot be written, or `corner` names what is no parameter.
     """
-    posterior, truth = chain.posterior(), job.truth if job else None
+    posterior = chain.posterior()
+    truth = chain.record.truth if chain.record else None
+    shown = corner_parameters(chain.draws(), chain.parameter_names, corner)
     diagnostics = diagnose(chain, target_ess=target_ess)
     table = summary(chain, truth=truth, columns=diagnostics.columns)
     fitted = FittedFrame.at(posterior, chain.estimate.params)
-    page, picture = beside(path)
+    page, picture, sources = outputs.beside(page)
     write_report(
         page,
-        title=printable((job.run_file if job else path).stem),
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
-        figures=page_figures(fitted, chain, truth=truth),
-        notes=job.notes if job else (),
-        settings=job.run.model_dump_json(indent=2) if job else None,
+        figures=page_figures(fitted, chain, diagnostics, shown=shown, truth=truth),
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
-    return Result(chain, diagnostics, table, path, page, picture)
-
-
-def beside(chain: Path) -> tuple[Path, Path]:
-    """Name the page and the picture of a chain file.
-
-    Parameters
-    ----------
-    chain : Path
-
-    Returns
-    -------
-    page, picture : Path
-
-    Examples
-    --------
-    >>> [path.name for path in beside(Path("run.h5"))]
-    ['run.html', 'run.png']
-    """
-    return chain.with_suffix(".html"), chain.with_suffix(".png")
-
-
-def make_folder(path: Path) -> None:
-    """Create the folder of an output file, unless it exists.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be created.
-    """
-    with atomic.writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    found = diagnostics.sources
+    columns = {name: found[name].data for name in found.colnames}
+    tables.write_table(sources, tables.TableRecord(columns, SOURCES_META), overwrite=True)
+    return Result(chain, diagnostics, table, path, page, picture, sources)
 
 
 @contextmanager

@@ -37,6 +37,7 @@ __all__ = [
     "described",
     "mistake",
     "model_of",
+    "toml",
 ]
 
 # Far outside what frames need, and far inside what float64, int64 and memory hold.
@@ -167,6 +168,55 @@ def described(section: str, table: Any) -> ObjectSettings:
     MoffatPSF(fwhm=4.0, beta=3.0)
     """
     return model_of(section, table).model_validate_json(json.dumps(table))
+
+
+def toml(run: Section) -> str:
+    """Write a run as the text of a run file, every default included.
+
+    Parameters
+    ----------
+    run : Section
+        The whole run file, or one section.
+
+    Returns
+    -------
+    str
+        TOML. Characters that cannot be shown are escaped, so that the text can be read and copied
+        from a page.
+
+    Examples
+    --------
+    >>> print(toml(described("psf", {"kind": "moffat", "fwhm": 4.0, "beta": 3})))
+    kind = "moffat"
+    fwhm = 4.0
+    beta = 3.0
+    """
+    return _table((), run.model_dump(exclude_none=True)).strip()
+
+
+def _table(name: tuple[str, ...], table: dict[str, Any]) -> str:
+    """A table of TOML with those in it; nothing for one without keys."""
+    parts = {key: part for key, part in table.items() if isinstance(part, dict)}
+    lines = [f"{_key_text(k)} = {_value(v)}\n" for k, v in table.items() if k not in parts]
+    head = f"\n[{'.'.join(map(_key_text, name))}]\n" if name and lines else ""
+    return head + "".join(lines) + "".join(_table((*name, k), part) for k, part in parts.items())
+
+
+def _key_text(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, str):  # JSON escapes as TOML does; it leaves what cannot be shown
+        text = json.dumps(value, ensure_ascii=False)
+        return "".join(c if c.isprintable() else _escape(ord(c)) for c in text)
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _escape(code: int) -> str:
+    return f"\\u{code:04x}" if code < 2**16 else f"\\U{code:08x}"
 
 
 def mistake(details: Any, root: type[Section], table: Any) -> str:

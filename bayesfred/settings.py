@@ -3,7 +3,7 @@
 Each section is a frozen model with the keys, units and defaults of the run file;
 :func:`read_settings` checks all of them at once and says every mistake in one line. The sections
 `[detector]`, `[psf]`, `[noise]` and `[nuisances]` have the fields of the class that they describe,
-see `sections`; `kind` names the class. `build` makes the objects. `model_dump_json` gives the text
+see `sections`; `kind` names the class. `build` makes the objects. `sections.toml` gives the text
 that result files keep. `example.toml` beside this module is a complete run file.
 """
 
@@ -374,8 +374,7 @@ def read_settings(path: PathLike) -> RunSettings:
     try:
         # A byte order mark, which some editors write, is not TOML.
         table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        # JSON is what result files keep, so a run file is checked by the rules it will be read back
-        # with. Dates, which only TOML has, are no key's type.
+        # The rules are those of JSON. Dates, which only TOML has, are no key's type.
         return RunSettings.model_validate_json(
             json.dumps(table, default=lambda date: {str(date): "date"})
         )

@@ -29,7 +29,9 @@ def show_run(result: Result) -> bool:
             f"prior-dominated: {', '.join(diagnostics.prior_dominated)}: the frame does not "
             "decide alone, see the report"
         )
-    _print_files(chain=result.path, report=result.page, picture=result.picture)
+    _print_files(
+        chain=result.path, report=result.page, picture=result.picture, sources=result.sources
+    )
     print(diagnostics.message)
     return diagnostics.trustworthy
 

@@ -43,7 +43,7 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
 from bayesfred.pipeline import read_frame
 from bayesfred.sampling.chain import Chain
-from bayesfred.sampling.chainfile import open_chain
+from bayesfred.sampling.chainfile import fingerprint, open_chain
 from bayesfred.settings import RunSettings, read_settings
 
 ROOT = Path(__file__).parents[1]
@@ -262,7 +262,7 @@ def check_page_and_picture(folder: Path, stem: str) -> None:
     assert {"html", "table", "img"} <= found.tags
     assert not found.tags & {"script", "link", "iframe", "object", "embed", "base"}
     assert found.references
-    assert all(reference.startswith("data:image/png;base64,") for reference in found.references)
+    assert all(re.match("data:image/png;base64,|#", text) for text in found.references)
     assert not re.search(r"@import|url\(", page)
     picture = np.asarray(imread(folder / f"{stem}.png"))
     assert picture.ndim == 3
@@ -424,6 +424,15 @@ def test_demo(tmp_path: Path) -> None:
     assert (
         verdict.prior_dominated == () and "prior-dominated" not in output.stdout
     )  # the default priors are weak
+
+    # the settings on its page describe the same frame, model and run
+    (tmp_path / "run.toml").write_text(settings_on(folder / "demo.html"))
+    assert invoke(tmp_path, "simulate", "run.toml").code == 0
+    assert fingerprint(read(tmp_path)[0]) == fingerprint(chain.posterior())
+    described = read_settings(tmp_path / "run.toml").sampling
+    assert (described.seed, described.ensembles) == (chain.seed, len(chain.chain))
+    assert chain.record is not None
+    assert chain.record.truth == pytest.approx([truth[name] for name in chain.parameter_names])
 
     before = snapshot(tmp_path)
     assert_refused(
@@ -888,6 +897,13 @@ def test_refusal_from_a_shell(folder: Path) -> None:
 # ------------------------------------------------------------------------------------------- what i
 
 
+def settings_on(page: Path) -> str:
+    """The run file that a page shows, as a browser would copy it."""
+    found = re.search(r"<pre[^>]*>(.*?)</pre>", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert found is not None
+    return html.unescape(found[1])
+
+
 def page_text(path: Path) -> str:
     """What a browser shows of a page."""
     return html.unescape(re.sub(r"<[^>]*>", "", path.read_text(encoding="utf-8")))
@@ -1054,7 +1070,8 @@ def test_report_replaces_links_and_leaves_their_targets(
     for name in ("run.html", "run.png"):
         (tmp_path / f"precious {name}").write_text("precious")
         (tmp_path / name).symlink_to(f"precious {name}")
-    assert invoke(tmp_path, "report", "run.h5").code in (0, 3)
+    assert_refused(invoke(tmp_path, "report", "run.h5"), "run.html", "exists", "--overwrite")
+    assert invoke(tmp_path, "report", "run.h5", "--overwrite").code in (0, 3)
     for name in ("run.html", "run.png"):
         assert (tmp_path / f"precious {name}").read_text() == "precious"
         assert not (tmp_path / name).is_symlink()
@@ -1101,12 +1118,12 @@ def test_names_are_escaped_on_the_page(folder: Path) -> None:
     page = (folder / "run.html").read_text(encoding="utf-8")
     found = _Tags(page)
     assert "script" not in found.tags
-    assert all(reference.startswith("data:image/png;base64,") for reference in found.references)
+    assert all(re.match("data:image/png;base64,|#", text) for text in found.references)
     assert 'onerror="' not in page
     shown = page_text(folder / "run.html")
     assert f"{EVIL}.fits: 60 x 75 pixels" in shown
     assert f"{EVIL}.csv: 9 sources" in shown
-    assert '"flux": "<script>"' in shown
+    assert 'flux = "<script>"' in shown
 
 
 CONTROL = "\x1b[31m[bold red]\r\nnight\x07\udcff"
@@ -1123,9 +1140,8 @@ def test_control_characters_and_markup_are_escaped(folder: Path) -> None:
     assert output.code == 3
     assert all(c.isprintable() for line in output.stdout.splitlines() for c in line)
     assert f"chains/{escaped}.h5" in output.stdout
-    assert f"<title>{escaped}</title>" in (folder / "chains" / f"{CONTROL}.html").read_text(
-        encoding="utf-8"
-    )
+    page = (folder / "chains" / f"{CONTROL}.html").read_text(encoding="utf-8")
+    assert f"<title>{escaped}: frame.fits, 60 × 75 pixels, " in page
 
     image = fits.ImageHDU(np.zeros((2, 2, 2)), name="<script>[red]")
     fits.HDUList([fits.PrimaryHDU(), image]).writeto(folder / "frame.fits", overwrite=True)

@@ -25,11 +25,19 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
+from bayesfred.reporting.figures import described_residual, page_figures
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
-from bayesfred.reporting.html import page_figures, write_report
+from bayesfred.reporting.html import write_report
 from bayesfred.reporting.labels import axis_label
-from bayesfred.reporting.posteriors import corner_plot, overview, trace_plot
+from bayesfred.reporting.posteriors import (
+    corner_parameters,
+    corner_plot,
+    marginal_plot,
+    overview,
+    trace_plot,
+)
 from bayesfred.reporting.screen import parameter_table
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.summary import summary, unit_text
 
 Floats = NDArray[np.float64]
@@ -58,6 +66,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         parameter_names=names,
         n_parameters=len(names),
         noise=PoissonNoise(),
+        prior={name: norm(0.0, 1.0) for name in names},
         nuisances=Nuisances(),
         model=model,
         log_prior=lambda draws: np.zeros(len(draws)),
@@ -80,6 +89,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "versions": {"numpy": "2.0", "bayesfred": "0.1"},
         "draws": lambda: chain[:, 2:].reshape(-1, len(names)),
         "posterior": lambda: posterior,
+        "record": RunRecord("A frame", made="2026-11-22T04:00:17+00:00"),
     }
     return SimpleNamespace(**fields), posterior
 
@@ -117,6 +127,7 @@ class Page(HTMLParser):
         super().__init__()
         self.tags: list[str] = []
         self.links: list[str] = []
+        self.alternatives: list[str] = []
         self.text = ""
         self.open: list[str] = []
         self.feed(text)
@@ -124,12 +135,13 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
         self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.alternatives += [value or "" for name, value in attrs if name == "alt"]
         if tag not in ("meta", "img", "br"):
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
-        self.text += " " if tag == "td" else ""
+        self.text += " " if tag in ("td", "th") else ""
 
     def handle_data(self, data: str) -> None:
         self.text += data
@@ -144,7 +156,6 @@ def report(tmp_path: Path, *, truth: Floats | None = None, **changes: Any) -> tu
     chain = changes.get("chain") or run()[0]
     diagnostics = changes.get("diagnostics") or diagnose(chain, target_ess=500.0)
     fields = {
-        "title": "A frame",
         "chain": chain,
         "summary": summary(chain, truth=truth, columns=diagnostics.columns),
         "diagnostics": diagnostics,
@@ -157,34 +168,86 @@ def report(tmp_path: Path, *, truth: Floats | None = None, **changes: Any) -> tu
 def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
     chain, posterior = run()
     truth = np.append(TRUTH, BACKGROUND)
-    figures = page_figures(fitted(posterior, chain.estimate.params), chain, truth=truth)
+    frame = fitted(posterior, chain.estimate.params)
+    figures = page_figures(frame, chain, diagnose(chain), shown=(0, 1, 3), truth=truth)
     text, page = report(tmp_path, truth=truth, chain=chain, figures=figures)
     assert not page.open
     assert "script" not in page.tags and "link" not in page.tags
-    assert len(page.links) == 4 and all(
-        link.startswith("data:image/png;base64,") for link in page.links
-    )
-    assert "http" not in re.sub(r"data:image/png;base64,[^\"]*", "", text)
-    for link in page.links:
+    images = [link for link in page.links if link.startswith("data:image/png;base64,")]
+    assert len(images) == 5 and all(link[0] == "#" for link in set(page.links) - set(images))
+    assert all(f'id="{link[1:]}"' in text for link in page.links if link[0] == "#")
+    assert "http:" not in text and "https:" not in text
+    assert "url(" not in re.sub(r"data:image/png;base64,[^\"]*", "", text)
+    for link in images:
         image = imread(BytesIO(base64.b64decode(link.split(",")[1])))
         assert image.shape[0] > 200 and image.shape[1] > 400 and image.std() > 0.02
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
+def test_alternative_texts_say_what_is_seen(tmp_path: Path) -> None:
+    """The numbers in them are those of the frame and of the draws."""
+    chain, posterior = run()
+    chain.chain[..., 1] = chain.chain[..., 0] * 2.0  # a correlation of 1
+    frame = fitted(posterior, chain.estimate.params)
+    figures = page_figures(frame, chain, diagnose(chain), shown=(0, 1, 3))
+    _, page = report(tmp_path, chain=chain, figures=figures)
+    residual = frame.residual()[frame.mask]
+    seen, stars, pairs, others, trace = page.alternatives
+    assert f"{frame.counts[frame.mask].max():.0f} counts" in seen
+    assert f"{residual.max():.1f} standard deviations" in seen
+    assert f"{100 * np.mean(np.abs(residual) > 3):.2f} % of {residual.size} pixels" in seen
+    assert stars == "Counts, model and residual side by side around 9 sources in the frame."
+    assert pairs.endswith("The strongest correlation is +1.00, of f_ux and f_ux2.")
+    assert others.startswith("Histograms of 2 parameters with their priors. At most a posterior is")
+    assert others.endswith("as its prior, that of background.")
+    assert trace.startswith("Traces and rank histograms of 5 parameters: 4 ensembles of 32 walkers")
+
+
+def test_residual_of_a_frame_without_pixels_is_described() -> None:
+    ones = np.ones((2, 2))
+    assert described_residual(FittedFrame(ones, ones, ones, ones > 1)) == "No pixel is used."
+
+
+def test_page_lists_causes(tmp_path: Path) -> None:
+    chain, _ = run()
+    found = diagnose(chain)
+    names = ("trustworthy", "columns", *found.__dataclass_fields__)
+    cause = SimpleNamespace(sentence="The PSF is too <wide>.", remedy="Fit its width.")
+    causes = SimpleNamespace(**{name: getattr(found, name) for name in names}, causes=(cause,))
+    text, page = report(tmp_path, chain=chain, diagnostics=causes)
+    assert "The PSF is too <wide>. Fit its width." in page.text
+    assert text.index('class="verdict') < text.index("The PSF is too") < text.index("<table")
+
+
 def test_page_says_what_it_must(tmp_path: Path) -> None:
-    text, page = report(
-        tmp_path,
-        truth=np.append(TRUTH, BACKGROUND),
-        notes=["Seen at dusk."],
-        settings='{"seed": 7}',
+    chain, _ = run()
+    chain.record = RunRecord(
+        "Night 3",
+        "sky.fits",
+        "[sampling]\nseed = 7",
+        ("Seen at dusk.",),
+        made="2026-11-22T04:00:17+00:00",
     )
+    truth = np.append(TRUTH, BACKGROUND)
+    text, page = report(tmp_path, chain=chain, truth=truth, result="The field is curved.")
     for words in (
         "trustworthy: The model fits the counts", "Sampled well: R-hat at most", "truth",
-        "ESS bulk", "Pearson", "Deviance", "Seen at dusk.", '{"seed": 7}', "numpy 2.0",
+        "ESS bulk", "Pearson", "Deviance", "Seen at dusk.", "[sampling]\nseed = 7", "numpy 2.0",
         "4 ensembles of 32 walkers", "chains/a & b.h5", "Prior-dominated: none.",
     ):  # fmt: skip
         assert words in page.text
     assert 'class="verdict good"' in text
+    what = (
+        "sky.fits, 61 × 81 pixels, 9 sources of fixed flux, Gaussian PSF, distortion of 4 terms, "
+        "Poisson noise"
+    )
+    made = "2026-11-22 04:00 UTC, bayesfred 0.1"
+    assert f"<title>Night 3: {what}; {made}</title>" in text
+    order = ["Night 3", what, made, "The field is curved.", "trustworthy: ", "Parameters"]
+    order += ["Goodness of fit", "Sampling", "Provenance", "Settings", "Notes"]
+    body = page.text[page.text.rindex("}") :]  # after the styles
+    places = [body.index(words) for words in order]
+    assert places == sorted(places)
     # uncertainty to two digits, value to the same place, in one power of ten
     assert re.search(r"10−6 px−1\s+3\.00\s+3\.00\s+(3\.0\d|2\.9\d)\s+0\.12\s", page.text)
     assert re.search(r"background\s+counts\s+5\.000\s+5\.000\s+[45]\.\d{3}\s+0\.03\d\s", page.text)
@@ -202,9 +265,12 @@ def test_page_names_what_the_prior_dominates(tmp_path: Path) -> None:
 
 
 def test_page_without_truth_or_notes(tmp_path: Path) -> None:
-    _, page = report(tmp_path)
+    chain, _ = run()
+    chain.record = None
+    _, page = report(tmp_path, chain=chain)
     assert "truth" not in page.text.split("Parameters")[1]
     assert "Notes" not in page.text and "Settings" not in page.text
+    assert "report: frame, 61 × 81 pixels" in page.text and "UTC" not in page.text
 
 
 def test_page_of_a_badly_sampled_chain_says_why(tmp_path: Path) -> None:
@@ -224,13 +290,14 @@ def test_page_of_a_misfit_says_so_first(tmp_path: Path) -> None:
 
 
 def test_everything_a_user_writes_is_escaped(tmp_path: Path) -> None:
-    evil = "<script>alert(1)</script>"
+    evil = "<script>alert(1)</script>\u202egnp"
     chain, _ = run((evil,))
     chain.versions[evil] = evil
     chain.path = Path(evil)
-    text, page = report(tmp_path, title=evil, chain=chain, notes=[evil], settings=evil)
-    assert "<script" not in text
-    assert page.text.count(evil) >= 6
+    chain.record = RunRecord(evil, evil, f"{evil}\n{evil}", (evil,))
+    text, page = report(tmp_path, chain=chain, result=evil)
+    assert "<script" not in text and "\u202e" not in text
+    assert page.text.count(evil.replace("\u202e", r"\u202e")) >= 10
     assert "script" not in page.tags
 
 
@@ -242,7 +309,7 @@ def test_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr("os.replace", fail)
     with pytest.raises(InputError, match=r"report\.html: cannot be written \(disk full\)"):
-        report(tmp_path, title="Another")
+        report(tmp_path, result="Another")
     assert (tmp_path / "report.html").read_text() == "old page"
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
@@ -323,6 +390,15 @@ def everything() -> Posterior:
     return Posterior(model, np.ones((9, 9)), nuisances=nuisances)
 
 
+def test_intervals_are_quantiles_of_the_draws(tmp_path: Path) -> None:
+    """Shown to two digits of the sd; a wrong level would be off by at least a quarter of it."""
+    chain, _ = run()
+    _, page = report(tmp_path, chain=chain)
+    low, high = np.quantile(chain.draws()[:, 4], (0.16, 0.84))
+    lowest, highest = np.quantile(chain.draws()[:, 4], (0.025, 0.975))
+    assert f"{low:.3f} … {high:.3f} {lowest:.3f} … {highest:.3f} " in page.text
+
+
 # --- figures --------------------------------------------------------------------------------------
 
 
@@ -342,6 +418,39 @@ def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:
     assert low < -2.0 < high and high - low < 2.0
     assert all(len(axis.get_ticklocs()) <= 4 for ax in figure.axes for axis in (ax.xaxis, ax.yaxis))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["truth", "MAP"]
+    assert pixels(figure).std() > 0.02
+
+
+def test_corner_chooses_the_most_correlated_pairs() -> None:
+    """Of thirty parameters, the six pairs that were made correlated; otherwise those named."""
+    draws = np.random.default_rng(4).normal(size=(2000, 30))
+    for k in range(6):
+        draws[:, 29 - k] += 2.0 * draws[:, k]
+    draws[:, 10] = 3.0
+    names = [f"p{k}" for k in range(30)]
+    assert corner_parameters(draws, names) == (*range(6), *range(24, 30))
+    assert corner_parameters(draws, names, ["p20", "p3"]) == (3, 20)
+    assert corner_parameters(draws[:, :12], names[:12]) == tuple(range(12))
+    with pytest.raises(InputError, match="corner: got p30, q, expected names among p0, p1"):
+        corner_parameters(draws, names, ["p1", "p30", "q"])
+
+
+@pytest.mark.parametrize("d", [1, 7, 18])
+def test_marginals_have_a_panel_and_a_prior_for_each_parameter(d: int) -> None:
+    rng = np.random.default_rng(6)
+    parameters = described(*(f"name {k}" for k in range(d)))
+    priors = {parameter.name: norm(0.0, 1.0) for parameter in parameters}
+    draws, middle = rng.normal(size=(800, d)), np.zeros(d)
+    draws[:, 0] = 3.0  # never moved
+    figure = marginal_plot(draws, parameters, priors, truth=middle, estimate=middle)
+    shown = [ax for ax in figure.axes if ax.get_visible()]
+    assert len(shown) == d
+    for ax in shown[1:]:
+        height = ax.get_ylim()[1]
+        prior = next(
+            np.asarray(line.get_ydata()) for line in ax.lines if line.get_label() == "prior"
+        )
+        assert max(prior) == pytest.approx(norm.pdf(0.0), rel=0.01) and height > max(prior)
     assert pixels(figure).std() > 0.02
 
 

@@ -19,7 +19,7 @@ time.
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import arviz_base
 import lazy_loader
@@ -27,6 +27,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats, Ints
+from bayesfred.analysis.checks import Check, check_table
+from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_checks
+from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import CONSISTENT, fit_statistics, misfit
 from bayesfred.sampling.chain import Chain
@@ -94,6 +97,13 @@ class Diagnostics:
         A coefficient of the distortion is among them only if the prior decides a displacement that
         it takes part in: the sensitivity of the displacement along the coefficient's pattern over
         the frame is at least 0.05 too.
+    residuals : Residuals or None
+        The table of sources, and what the residuals show; None for a density that is not a
+        `Posterior` of a frame.
+    checks : astropy.table.Table
+        A row for each check of the fit, with the columns name, value, expected, sd, z and meaning:
+        the two sums above, the randomised PIT, the whiteness of the residuals, displacement against
+        pixel phase, and the posterior predictive draws that were asked for.
     """
 
     sampled_well: bool
@@ -118,6 +128,13 @@ class Diagnostics:
     prior_sensitivity: dict[str, float]
     likelihood_sensitivity: dict[str, float]
     prior_dominated: tuple[str, ...]
+    residuals: Residuals | None = field(repr=False, compare=False)
+    checks: Table = field(repr=False, compare=False)
+
+    @property
+    def sources(self) -> Table:
+        """How well every source agrees with the counts, see `analysis.sources.source_table`."""
+        return make_table({}) if self.residuals is None else self.residuals.sources
 
     @property
     def trustworthy(self) -> bool:
@@ -137,7 +154,7 @@ class Diagnostics:
         }
 
 
-def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
+def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -> Diagnostics:
     """Judge how a chain is sampled, whether its model fits the counts, and what its prior does.
 
     Sampled well means: largest R-hat at most 1.01, every bulk and tail effective sample size at
@@ -150,6 +167,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         A finished or running chain.
     target_ess : float, optional
         Effective draws demanded of every parameter.
+    predictive : int, optional
+        Number of draws, 50 say, at which a frame is simulated for posterior predictive checks.
 
     Returns
     -------
@@ -178,6 +197,14 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         else f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
         f"{min(bulk.min(), tail.min()):.0f}, acceptance {acceptance:.1%}."
     )
+    residuals, checks = None, _sums(fit)
+    if isinstance(posterior, Posterior):
+        residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
+        checks += residuals.checks
+    if predictive:
+        draws = _draws(chain)
+        some = np.linspace(0, len(draws) - 1, min(predictive, len(draws))).astype(int)
+        checks += predictive_checks(posterior, draws[some], seed=chain.seed)
     prior, likelihood = _sensitivities(chain, posterior)
     dominated = prior >= INFORMATIVE
     dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
@@ -194,6 +221,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0) -> Diagnostics:
         prior_sensitivity=_by_name(names, prior),
         likelihood_sensitivity=_by_name(names, likelihood),
         prior_dominated=tuple(np.array(names)[dominated].tolist()),
+        residuals=residuals,
+        checks=check_table(checks),
         **fit,
     )
 
@@ -291,6 +320,20 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
 
 def _by_name(names: tuple[str, ...], values: Floats) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _sums(fit: Mapping[str, float]) -> list[Check]:
+    """Pearson's statistic and the deviance."""
+    meanings = {
+        "Pearson": "sum of squared residuals in standard deviations",
+        "deviance": "twice the log-likelihood that a perfect model would gain",
+    }
+    checks = []
+    for name, meaning in meanings.items():
+        value, expected, sd = (fit[f"{name.lower()}{part}"] for part in ("", "_expected", "_sd"))
+        z = (value - expected) / sd if sd > 0.0 else float("nan")
+        checks.append(Check(name, value, expected, sd, z, meaning))
+    return checks
 
 
 def _fit_sentence(fit: Mapping[str, float]) -> str:

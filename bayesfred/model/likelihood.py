@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from bayesfred._typing import Flags, Floats
+from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Optics, stride
 from bayesfred.imaging.kernels.render import render as render_sources
@@ -35,6 +36,7 @@ from bayesfred.model.kernels.evaluate import log_likelihoods, render
 from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
+from bayesfred.model.kernels.sources import OwnPixels, own_pixels
 from bayesfred.model.noise import Noise
 from bayesfred.model.parameters import (
     BACKGROUND_POWERS,
@@ -159,6 +161,43 @@ class FrameLikelihood:
     def fluxes(self, params: Floats) -> Floats:
         """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
         return self._expected(params)[1]
+
+    def own_pixels(self, params: Floats, radius: float) -> tuple[OwnPixels, Floats, Floats, Floats]:
+        """The sources' own pixels and templates, and the model that these belong to.
+
+        Parameters
+        ----------
+        params : ndarray, shape (d,)
+        radius : float, fine pixel
+            Distance in the coordinates (a, b) of the PSF within which a pixel is a source's own.
+
+        Returns
+        -------
+        OwnPixels
+        expected : ndarray, shape (ny, nx), counts per pixel
+        fluxes : ndarray, shape (s,), counts
+        shifts : ndarray, shape (s, 2), fine pixel
+            Most likely shifts along a and b; zero unless positions scatter.
+
+        Raises
+        ------
+        InputError
+            Where the likelihood is zero because the map folds.
+        """
+        with self._rendered(params) as (w, rendered, parameters):
+            if not rendered.extra > -np.inf:
+                raise InputError(
+                    "params: got parameters that leave a source without an image, expected ones "
+                    "of a positive likelihood, such as those of find_map"
+                )
+            fluxes, profiled = rendered.fluxes, rendered.profiled
+            shifts = np.zeros((fluxes.size, 2)) if profiled is None else profiled.shifts
+            optics = self._optics._replace(support_radius=radius / parameters.nuisances.psf_sigma)
+            frame = self.mask, w.image.reshape(self.mask.shape[0], -1)
+            own = own_pixels(optics, parameters, (fluxes, shifts), radius, frame)
+            sources = frame[1][:, : self.mask.shape[1]].copy()
+        level = self._background(parameters.background)
+        return own, sources + level, fluxes, shifts
 
     def simulate(self, params: Floats, rng: np.random.Generator) -> Floats | None:
         """Draw a frame given the parameters, free fluxes and the sources' shifts from their priors.

@@ -23,7 +23,9 @@ from bayesfred.model.posterior import Posterior
 
 __all__ = ["FittedFrame", "draw_triptych", "frame_triptych", "star_panels", "triptych_height"]
 
-MASKED = "0.72"
+# Light where there is little: a page in dark mode inverts its figures, see `template.html`.
+COUNTS_MAP, RESIDUAL_MAP = "gray_r", "RdBu_r"
+MASKED = "#a9d18e"  # a colour that neither map has
 RESIDUAL_LIMIT = 5.0
 TRIPTYCH_MARGIN, TRIPTYCH_SIDE = 0.7, 5.6
 MAX_STARS = 24
@@ -38,7 +40,7 @@ class FittedFrame:
     counts, expected, sigma : ndarray, shape (ny, nx), counts per pixel
         Frame, model, and the standard deviation that the noise model gives each pixel.
     mask : ndarray of bool, shape (ny, nx)
-        True where a pixel enters the likelihood; the others are grey in a residual, and in the
+        True where a pixel enters the likelihood; the others are green in a residual, and in the
         frame if they are empty.
     """
 
@@ -137,9 +139,9 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
             data, model, difference = (stamp(layer, column[s], row[s]) for layer in layers)
             norm = _stretch(data, model)
             axes = [fig.add_subplot(grid[r, c]) for c in range(3)]
-            _show(axes[0], data, norm, "viridis")
-            _show(axes[1], model, norm, "viridis")
-            last = _show(axes[2], difference, _sigma_norm(), "RdBu_r")
+            _show(axes[0], data, norm, COUNTS_MAP)
+            _show(axes[1], model, norm, COUNTS_MAP)
+            last = _show(axes[2], difference, _sigma_norm(), RESIDUAL_MAP)
             position = f"{u[s]:+.0f}, {v[s]:+.0f}"
             axes[1].text(
                 0.04,
@@ -147,13 +149,13 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
                 position,
                 transform=axes[1].transAxes,
                 va="top",
-                color="white",
-                fontsize=7,
+                color="black",
+                fontsize=8.5,
             )
             for ax, title in zip(axes, ("counts", "model", "residual"), strict=True):
                 ax.set(xticks=[], yticks=[])
                 if r == 0:
-                    ax.set_title(title, fontsize=8.5)
+                    ax.set_title(title, fontsize=10)
     bar = fig.add_axes((1 - 0.65 / width, 0.04, 0.14 / width, 0.86))
     fig.colorbar(last, cax=bar, label="residual / sigma")
     return fig
@@ -186,24 +188,26 @@ def draw_triptych(fig: Figure, axes: Sequence[Axes], fitted: FittedFrame) -> Non
     ny, nx = fitted.counts.shape
     extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
     norm = _stretch(fitted.counts[fitted.mask], fitted.expected[fitted.mask])
-    _show(axes[0], fitted.recorded(), norm, "viridis", extent)
-    _show(axes[1], fitted.expected, norm, "viridis", extent)
+    _show(axes[0], fitted.recorded(), norm, COUNTS_MAP, extent)
+    _show(axes[1], fitted.expected, norm, COUNTS_MAP, extent)
     # inset axes are exactly as high as the image beside them
     bar = fig.colorbar(
-        ScalarMappable(norm, "viridis"),
+        ScalarMappable(norm, COUNTS_MAP),
         cax=axes[1].inset_axes((1.02, 0.0, 0.035, 1.0)),
-        label="counts per pixel",
     )
+    bar.set_label("counts per pixel", fontsize=13)
     ticks = _even_ticks(norm)
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()
-    residual = _show(axes[2], fitted.residual(), _sigma_norm(), "RdBu_r", extent)
-    fig.colorbar(
-        residual, cax=axes[2].inset_axes((1.02, 0.0, 0.035, 1.0)), label="residual / sigma"
-    )
+    residual = _show(axes[2], fitted.residual(), _sigma_norm(), RESIDUAL_MAP, extent)
+    scale = fig.colorbar(residual, cax=axes[2].inset_axes((1.02, 0.0, 0.035, 1.0)))
+    scale.set_label("residual / sigma", fontsize=13)
     for ax, title in zip(axes, ("frame", "model", "residual"), strict=True):
-        ax.set(title=title, xlabel="u / pixel")
-    axes[0].set_ylabel("v / pixel")
+        ax.set_title(title, fontsize=15)
+        ax.set_xlabel("u / pixel", fontsize=13)
+    axes[0].set_ylabel("v / pixel", fontsize=13)
+    for ax in (*axes, bar.ax, scale.ax):
+        ax.tick_params(labelsize=12)
 
 
 def _show(
@@ -213,7 +217,7 @@ def _show(
     colours: str,
     extent: tuple[float, float, float, float] | None = None,
 ) -> AxesImage:
-    """An image whose pixels that are not finite are grey; unsmoothed, so that noise stays noise."""
+    """An image, green where it is not finite; unsmoothed, so that noise stays noise."""
     cmap: Colormap = colormaps[colours].with_extremes(bad=MASKED)
     image = np.ma.masked_invalid(frame)
     return ax.imshow(

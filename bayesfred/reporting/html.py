@@ -2,20 +2,21 @@
 
 The page loads nothing from elsewhere and runs no script, so that it can be mailed, archived and
 opened years later. Text that comes from a user is escaped by the template engine.
-`bayesfred.sampling.summary` and `bayesfred.analysis.diagnostics` supply the numbers; the figures
-are those of `bayesfred.reporting.frames` and `bayesfred.reporting.posteriors`.
+`bayesfred.sampling.summary` and `bayesfred.analysis.diagnostics` supply the numbers,
+`bayesfred.reporting.figures` the figures. `base.html` has the styles of all pages.
 """
 
-import base64
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.diagnostics import Diagnostics
@@ -24,13 +25,15 @@ from bayesfred.io import atomic
 from bayesfred.io.summary_table import Table
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
-from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.figures import PageFigure
 from bayesfred.reporting.labels import html_symbol, html_unit, scale_of
-from bayesfred.reporting.posteriors import corner_plot, trace_plot
-from bayesfred.reporting.style import png
+from bayesfred.reporting.style import embedded
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.record import RunRecord
 
-__all__ = ["PageFigure", "page_figures", "write_report"]
+__all__ = ["described_model", "embedded_figures", "made_text", "render", "write_report"]
+
+LEVELS = (0.025, 0.16, 0.84, 0.975)  # of the intervals of 68 % and 95 %
 
 # digits after the point of what is dimensionless
 DIGITS = {
@@ -41,14 +44,6 @@ DIGITS = {
     "prior_sensitivity": 3,
     "likelihood_sensitivity": 3,
 }
-
-
-class PageFigure(NamedTuple):
-    """A figure of the page with what stands above and below it."""
-
-    heading: str
-    caption: str
-    figure: Figure
 
 
 @dataclass(frozen=True)
@@ -66,13 +61,11 @@ class _Statistic:
 def write_report(
     path: PathLike,
     *,
-    title: str,
     chain: Chain,
     summary: Table,
     diagnostics: Diagnostics,
     figures: Sequence[PageFigure] = (),
-    notes: Sequence[str] = (),
-    settings: str | None = None,
+    result: str | None = None,
 ) -> Path:
     """Write the report of a run as one HTML file, in one step: the old page stays until then.
 
@@ -80,9 +73,8 @@ def write_report(
     ----------
     path : path-like
         Where the page goes; an existing file is replaced.
-    title : str
-        Heading of the page.
     chain : Chain
+        Its `record` gives title, frame, settings and notes.
     summary : Table
         The parameters of `chain`, see `bayesfred.sampling.summary.summary`, with
         `Diagnostics.columns`.
@@ -90,10 +82,8 @@ def write_report(
         What `diagnose` said of `chain`.
     figures : sequence of PageFigure, optional
         In the page's order.
-    notes : sequence of str, optional
-        Paragraphs of plain text.
-    settings : str, optional
-        The run's settings, printed as they are.
+    result : str, optional
+        A sentence with what was found, which leads the page.
 
     Returns
     -------
@@ -106,44 +96,158 @@ def write_report(
         If the page cannot be written.
     """
     path = Path(path)
-    environment = Environment(
-        loader=PackageLoader("bayesfred.reporting", ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    posterior, record = chain.posterior(), chain.record or RunRecord(path.stem)
+    parameters = {p.name: p for p in posterior.parameters}
+    levels = dict(
+        zip(chain.parameter_names, np.quantile(chain.draws(), LEVELS, axis=0).T, strict=True)
     )
-    parameters = {p.name: p for p in chain.posterior().parameters}
-    page = environment.get_template("template.html").render(
-        title=title,
+    made = "bayesfred " + chain.versions["bayesfred"]
+    if chain.record:
+        made = f"{made_text(record)}, {made}"
+    heading, subtitle = record.title, described_model(record, posterior)
+    page = render(
+        "run.html",
+        title=f"{heading}: {subtitle}; {made}",
+        heading=heading,
+        subtitle=subtitle,
+        made=made,
+        result=result,
         diagnostics=diagnostics,
-        rows=[_row(dict(row), parameters[row["name"]]) for row in summary],
+        causes=getattr(diagnostics, "causes", ()),
+        rows=[_row(dict(row), parameters[row["name"]], levels[row["name"]]) for row in summary],
         prior_dominated=Markup(", ").join(
             html_symbol(parameters[name]) for name in diagnostics.prior_dominated
         ),
         has_truth="truth" in summary.colnames,
         statistics=_statistics(diagnostics),
-        figures=[(f.heading, f.caption, _data_uri(f.figure)) for f in figures],
+        figures=embedded_figures(figures),
         provenance=_provenance(chain, diagnostics),
-        notes=notes,
-        settings=settings,
+        notes=record.notes,
+        settings=_lines(record.settings or ""),
     )
-    atomic.replace(path, page.encode())
+    atomic.replace(path, page)
     return path
 
 
-def _row(values: dict[str, Any], parameter: Parameter) -> dict[str, str]:
-    """One parameter's cells by column of the summary, its numbers in one power of ten."""
+def render(template: str, **values: Any) -> bytes:
+    """Fill in a template of this folder: what is no markup is escaped, and printable.
+
+    Parameters
+    ----------
+    template : str
+        Its file's name.
+    **values : object
+
+    Returns
+    -------
+    bytes
+    """
+    environment = Environment(
+        loader=PackageLoader("bayesfred.reporting", ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values).encode()
+
+
+def _shown(value: Any) -> Any:
+    """Text without characters that show nothing, or turn what follows: they are escaped."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def _lines(text: str) -> Markup:
+    """A text of several lines."""
+    return Markup("\n").join(Markup("{}").format(printable(line)) for line in text.split("\n"))
+
+
+def embedded_figures(figures: Sequence[PageFigure]) -> list[dict[str, Any]]:
+    """Figures as a template takes them.
+
+    Parameters
+    ----------
+    figures : sequence of PageFigure
+
+    Returns
+    -------
+    list of dict
+    """
+    return [{**f._asdict(), "image": embedded(f.figure)} for f in figures]
+
+
+def made_text(record: RunRecord) -> str:
+    """Date and time of a run.
+
+    Parameters
+    ----------
+    record : RunRecord
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> made_text(RunRecord(made="2026-11-22T04:00:17+00:00"))
+    '2026-11-22 04:00 UTC'
+    """
+    return f"{datetime.fromisoformat(record.made):%Y-%m-%d %H:%M} UTC"
+
+
+def described_model(record: RunRecord, posterior: Posterior) -> str:
+    """The frame and its model in words.
+
+    Parameters
+    ----------
+    record : RunRecord
+    posterior : Posterior
+
+    Returns
+    -------
+    str
+    """
+    model, free = posterior.model, posterior.nuisances
+    ny, nx = posterior.counts.shape
+    box = " integrated over the pixel" if model.detector.pixel == "box" else ""
+    number = len(model.sources)
+    parts = [
+        f"{record.frame or 'frame'}, {ny} × {nx} pixels",
+        f"{number} source{'s' * (number != 1)} of {free.flux} flux",
+        f"{_words(model.psf)}{box}",
+        f"distortion of {model.distortion.n_terms} terms",
+        _words(posterior.noise),
+    ]
+    names = [name.replace("_", " ") for name in free.names]
+    return ", ".join(parts) + (f"; also free: {', '.join(names)}" if names else "")
+
+
+def _words(value: Any) -> str:
+    """The name of a class in words, abbreviations kept."""
+    name = re.sub("(?<=[a-z])(?=[A-Z])", " ", type(value).__name__)
+    first, *rest = name.split()
+    return " ".join([first, *(word if word.isupper() else word.lower() for word in rest)])
+
+
+def _row(values: dict[str, Any], parameter: Parameter, levels: Floats) -> dict[str, str]:
+    """One parameter's cells by column of the summary, its numbers in one power of ten.
+
+    `levels` are the parameter's quantiles of `LEVELS`.
+    """
     scale = scale_of(values["mean"], values["sd"])
     cells: dict[str, str] = {
         key: _minus(scale.number(values[key]))
         for key in ("truth", "MAP", "mean", "sd")
         if key in values
     }
+    bounds = [_minus(scale.number(level)) for level in levels]
     cells |= {
         "symbol": html_symbol(parameter),
         "unit": html_unit(parameter, scale.exponent),
         "z": _z(values["z"]) if "z" in values else "",
+        "interval_68": f"{bounds[1]} … {bounds[2]}",
+        "interval_95": f"{bounds[0]} … {bounds[3]}",
     }
     return cells | {key: f"{values[key]:.{digits}f}" for key, digits in DIGITS.items()}
 
@@ -184,66 +288,6 @@ def _statistic(name: str, value: float, expected: float, sd: float, meaning: str
     )
 
 
-def page_figures(
-    fitted: FittedFrame, chain: Chain, *, truth: Floats | None = None
-) -> list[PageFigure]:
-    """The figures of a run's page.
-
-    Parameters
-    ----------
-    fitted : FittedFrame
-        The frame with the model at the MAP.
-    chain : Chain
-    truth : ndarray, shape (d,), parameter units, optional
-        Values that a simulation used.
-
-    Returns
-    -------
-    list of PageFigure
-    """
-    posterior = chain.posterior()
-    u, v, half_width = _star_positions(chain, posterior)
-    return [
-        PageFigure(
-            "Frame, model and residual",
-            "At the MAP. Grey pixels do not enter the likelihood.",
-            frame_triptych(fitted),
-        ),
-        PageFigure(
-            "Brightest sources",
-            "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced "
-            "source.",
-            star_panels(fitted, u, v, half_width=half_width),
-        ),
-        PageFigure(
-            "Posterior",
-            "Contours hold 39 % and 86 % of the draws.",
-            corner_plot(
-                chain.draws(), posterior.parameters, truth=truth, estimate=chain.estimate.params
-            ),
-        ),
-        PageFigure(
-            "Chain",
-            "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
-            "at 1 when all ensembles sample one distribution.",
-            trace_plot(chain, posterior.parameters),
-        ),
-    ]
-
-
-def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats, int]:
-    """Images of the sources in recorded pixels from the middle, and a stamp's half-width."""
-    model = posterior.model
-    params = dict(zip(chain.parameter_names, chain.estimate.params, strict=True))
-    theta = chain.estimate.params[: model.distortion.n_terms]
-    x = model.sources.x + params.get("offset_x", 0.0)
-    y = model.sources.y + params.get("offset_y", 0.0)
-    u, v = model.distortion.image_position(theta, x, y)
-    binning = model.detector.binning
-    half_width = max(4, math.ceil(3.5 * params.get("psf_sigma", model.psf.sigma) / binning))
-    return u / binning, v / binning, half_width
-
-
 def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     n_ensembles, n_steps, n_walkers, d = chain.chain.shape
     return [
@@ -262,10 +306,6 @@ def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]
             ", ".join(f"{name} {version}" for name, version in sorted(chain.versions.items())),
         ),
     ]
-
-
-def _data_uri(figure: Figure) -> str:
-    return "data:image/png;base64," + base64.b64encode(png(figure, dpi=100)).decode("ascii")
 
 
 def _minus(number: str) -> str:

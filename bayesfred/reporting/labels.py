@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from bayesfred._typing import Floats
+from bayesfred.errors import printable
 from bayesfred.model.parameters import Parameter
 
 __all__ = [
@@ -168,7 +169,7 @@ def html_symbol(parameter: Parameter) -> Markup:
     <i>f</i><sub>ux<sup>2</sup></sub>
     """
     if not parameter.letter:
-        return Markup("{}").format(parameter.name.replace("_", " "))
+        return Markup("{}").format(printable(parameter.name.replace("_", " ")))
     powers = Markup("").join(_raised(variable, power) for variable, power in parameter.powers)
     return Markup("<i>{}</i><sub>{}</sub>").format(parameter.letter, powers)
 

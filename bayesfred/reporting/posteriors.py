@@ -7,7 +7,7 @@ one page.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import corner
@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from bayesfred._typing import Floats
+from bayesfred.errors import InputError
 from bayesfred.model.parameters import Parameter
 from bayesfred.reporting.frames import FittedFrame, draw_triptych, triptych_height
 from bayesfred.reporting.labels import axis_label, math_symbol, power_of_ten, scale_of
@@ -29,10 +30,63 @@ from bayesfred.reporting.style import (
 )
 from bayesfred.sampling.chain import Chain
 
-__all__ = ["corner_plot", "overview", "trace_plot"]
+__all__ = ["corner_parameters", "corner_plot", "marginal_plot", "overview", "trace_plot"]
 
+MAX_CORNER = 12  # parameters in pairs that a page shows readably
 MAX_CORNER_DRAWS = 20_000
 MAX_TRACE_STEPS = 1_000
+
+
+def corner_parameters(
+    draws: Floats, names: Sequence[str], given: Sequence[str] = ()
+) -> tuple[int, ...]:
+    """Choose the parameters that are shown in pairs.
+
+    A panel of a pair tells more than two histograms only where the two are correlated. So of more
+    than twelve parameters those are chosen that make up the most correlated pairs.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (n, d), parameter units
+    names : sequence of str, length d
+    given : sequence of str, optional
+        Show these instead.
+
+    Returns
+    -------
+    tuple of int
+        Indices in increasing order.
+
+    Raises
+    ------
+    InputError
+        A name is no parameter's.
+
+    Examples
+    --------
+    >>> corner_parameters(np.eye(3), ["f_ux", "g_vy", "background"], ["background", "f_ux"])
+    (0, 2)
+    """
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise InputError(
+            f"corner: got {', '.join(unknown)}, expected names among {', '.join(names)}"
+        )
+    if given:
+        return tuple(k for k, name in enumerate(names) if name in given)
+    if len(names) <= MAX_CORNER:
+        return tuple(range(len(names)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.nan_to_num(np.abs(np.corrcoef(draws, rowvar=False)))
+    rows, columns = np.triu_indices(len(names), 1)
+    chosen: set[int] = set()
+    for pair in np.argsort(-correlation[rows, columns], kind="stable"):
+        joined = chosen | {int(rows[pair]), int(columns[pair])}
+        if len(joined) <= MAX_CORNER:
+            chosen = joined
+        if len(chosen) == MAX_CORNER:
+            break
+    return tuple(sorted(chosen))
 
 
 def corner_plot(
@@ -63,7 +117,7 @@ def corner_plot(
         axis_label(parameter, round(math.log10(s)), "\n")
         for parameter, s in zip(parameters, scale, strict=True)
     ]
-    side = 1.6 + 1.0 * d
+    side = 1.6 + 0.97 * d
     fig = Figure(figsize=(side, side), dpi=100)
     fig.subplots(d, d, squeeze=False)
     small = d > 6
@@ -94,7 +148,7 @@ def corner_plot(
             corner.overplot_lines(fig, values / scale, color=colour, linestyle=style, linewidth=0.9)
             marked.append((label, colour, style))
     for ax in fig.axes:
-        ax.tick_params(labelsize=7.5 if small else 8.5, length=2, pad=1.5)
+        ax.tick_params(labelsize=8 if small else 8.5, length=2, pad=1.5)
         for axis in (ax.xaxis, ax.yaxis):
             formatter = axis.get_major_formatter()
             if isinstance(formatter, ScalarFormatter):
@@ -118,6 +172,70 @@ def corner_plot(
             fontsize=10 if small else 8,
             frameon=False,
         )
+    return fig
+
+
+def marginal_plot(
+    draws: Floats,
+    parameters: Sequence[Parameter],
+    priors: Mapping[str, Any],
+    *,
+    truth: Floats | None = None,
+    estimate: Floats | None = None,
+) -> Figure:
+    """A histogram of each parameter's draws with the density of its prior.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (n, d), parameter units
+    parameters : sequence of Parameter, length d
+    priors : mapping of str to frozen scipy.stats distribution
+        By the parameters' names.
+    truth, estimate : ndarray, shape (d,), parameter units, optional
+        Values to mark: those a simulation used, and the MAP.
+
+    Returns
+    -------
+    Figure
+    """
+    d, columns = len(parameters), 6
+    rows = -(-d // columns)
+    fig = Figure(figsize=(13, 0.45 + 1.75 * rows), dpi=100, layout="constrained")
+    axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[d:]:
+        ax.set_visible(False)
+    for k, (ax, parameter) in enumerate(zip(axes, parameters, strict=False)):
+        span = _span(draws[:, k], None if truth is None else truth[k])
+        exponent = power_of_ten(np.array(span))
+        scale = 10.0**exponent
+        edges = np.linspace(*span, 41)
+        height = np.histogram(draws[:, k], edges)[0] / max(
+            len(draws) * (edges[1] - edges[0]), 1e-300
+        )
+        ax.stairs(height, edges / scale, color=POSTERIOR_COLOUR, fill=True, alpha=0.35)
+        ax.stairs(height, edges / scale, color=POSTERIOR_COLOUR, linewidth=1.0, label="posterior")
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        ax.plot(
+            middle / scale, priors[parameter.name].pdf(middle), "-.", color="0.3", linewidth=1.1,
+            label="prior",
+        )  # fmt: skip
+        for values, colour, style, label in (
+            (truth, TRUTH_COLOUR, "-", "truth"),
+            (estimate, ESTIMATE_COLOUR, "--", "MAP"),
+        ):
+            if values is not None:
+                ax.axvline(
+                    values[k] / scale, color=colour, linestyle=style, linewidth=1.0, label=label
+                )
+        ax.set(xlim=(span[0] / scale, span[1] / scale), ylim=(0, None), yticks=[])
+        ax.xaxis.set_major_locator(MaxNLocator(3))
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.tick_params(labelsize=8.5)
+        ax.set_xlabel(axis_label(parameter, exponent), fontsize=9.5)
+    handles, labels = axes[0].get_legend_handles_labels()
+    fig.legend(
+        handles, labels, loc="outside upper center", ncols=len(labels), fontsize=9, frameon=False
+    )
     return fig
 
 

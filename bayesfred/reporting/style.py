@@ -1,10 +1,21 @@
 """What all figures share: colours, and how a figure becomes a file's content."""
 
+import base64
 import io
+from typing import NamedTuple
 
 from matplotlib.figure import Figure
+from PIL import Image
 
-__all__ = ["ENSEMBLE_COLOURS", "ESTIMATE_COLOUR", "POSTERIOR_COLOUR", "TRUTH_COLOUR", "png"]
+__all__ = [
+    "ENSEMBLE_COLOURS",
+    "ESTIMATE_COLOUR",
+    "POSTERIOR_COLOUR",
+    "TRUTH_COLOUR",
+    "Embedded",
+    "embedded",
+    "png",
+]
 
 POSTERIOR_COLOUR = "#0072b2"
 TRUTH_COLOUR = "#d55e00"
@@ -42,3 +53,43 @@ def png(figure: Figure, dpi: int = 150) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
     return buffer.getvalue()
+
+
+class Embedded(NamedTuple):
+    """An image within a page: its data as a URI, and its size in pixels."""
+
+    uri: str
+    width: int
+    height: int
+
+
+def embedded(figure: Figure) -> Embedded:
+    """Render a figure as an image within a page.
+
+    It has 256 colours, which makes it a third of a PNG of all colours.
+
+    Parameters
+    ----------
+    figure : Figure
+
+    Returns
+    -------
+    Embedded
+
+    Examples
+    --------
+    >>> embedded(Figure(figsize=(2, 1), dpi=100))[1:]
+    (200, 100)
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="rgba", dpi="figure", facecolor="white")
+    image = Image.frombytes("RGBA", figure.canvas.get_width_height(), buffer.getvalue())
+    few = image.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette, corner = few.getpalette() or [], few.getpixel((0, 0))
+    if isinstance(corner, int):  # the background, which is nearly white now
+        palette[3 * corner : 3 * corner + 3] = (255, 255, 255)
+        few.putpalette(palette)
+    buffer = io.BytesIO()
+    few.save(buffer, "png", optimize=True)
+    uri = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return Embedded(uri, *image.size)

@@ -14,6 +14,7 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.io.summary_table import Table
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.summary import summary
 
 __all__ = ["Chain"]
@@ -48,6 +49,8 @@ class Chain:
         The number of effective draws that was asked for.
     n_invalid : int
         Number of log-probabilities that were NaN or +inf and were taken as -inf.
+    record : RunRecord or None
+        Title, frame, settings, notes and truth of the run, where they were given.
     """
 
     path: Path | None
@@ -62,6 +65,7 @@ class Chain:
     versions: dict[str, str]
     target_ess: float = 1000.0
     n_invalid: int = 0
+    record: RunRecord | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

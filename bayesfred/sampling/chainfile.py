@@ -1,7 +1,8 @@
 """The chain file: one HDF5 file a run, with everything needed to judge, replay and resume it.
 
 Groups `ensemble_0`, ... are in emcee's own layout. Beside them stand the posterior itself (frame,
-mask, model, noise, nuisances, priors), the MAP, the seed and the versions of what made it. A
+mask, model, noise, nuisances, priors), the MAP, the seed, the versions of what made it and, where
+there is one, the record of the run: title, frame, settings, notes and truth. A
 checkpoint writes a whole new file from memory and renames it over the old one, so that a reader
 finds either the old state or the new one. `io.hdf5_checks` says what a file must be before it is
 read, and `io.serialize` stores the objects in it.
@@ -24,6 +25,7 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.record import RunRecord
 
 # The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
 FORMAT = ("v110", "v110")
@@ -108,6 +110,8 @@ def write_chain(chain: Chain) -> None:
         )
         write(file.create_group("posterior"), chain.density)
         write(file.create_group("estimate"), chain.estimate)
+        if chain.record is not None:
+            write(file.create_group("record"), chain.record)
         for k, state in enumerate(chain.random_states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
     with content.getbuffer() as written:
@@ -140,13 +144,13 @@ def _refuse_shifted_poisson(file: h5py.File) -> None:
     Its log-probabilities are those of another model than the one that would be read.
     """
     noise = file["posterior/noise"].attrs
-    if file.attrs["schema"] < SCHEMA and noise["kind"] == b"noise.poisson":
-        if noise["read_noise"] > 0.0:
-            raise InputError(
-                f"noise: got read noise {noise['read_noise']:g} as the shifted Poisson "
-                f"distribution (schema {file.attrs['schema']}), expected the convolution with a "
-                "Gaussian that has replaced it: sample the frame again"
-            )
+    shifted = noise["kind"] == b"noise.poisson" and noise["read_noise"] > 0.0
+    if shifted and file.attrs["schema"] < SCHEMA:
+        raise InputError(
+            f"noise: got read noise {noise['read_noise']:g} as the shifted Poisson distribution "
+            f"(schema {file.attrs['schema']}), expected the convolution with a Gaussian that has "
+            "replaced it: sample the frame again"
+        )
 
 
 def _read(path: Path, file: h5py.File) -> Chain:
@@ -165,6 +169,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
         versions={name: version.decode() for name, version in file["versions"].attrs.items()},
         target_ess=float(file.attrs["target_ess"]),
         n_invalid=int(file.attrs["n_invalid"]),
+        record=read(file["record"], RunRecord) if "record" in file else None,
     )
     names = tuple(name.decode() for name in file.attrs["parameter_names"])
     if names != chain.parameter_names:
@@ -177,6 +182,8 @@ def _read(path: Path, file: h5py.File) -> Chain:
         "params": (chain.estimate.params, (d,)),
         "covariance": (chain.estimate.covariance, (d, d)),
     }
+    if chain.record is not None and chain.record.truth is not None:
+        expected["truth"] = chain.record.truth, (d,)
     wrong = [name for name, (array, right) in expected.items() if array.shape != right]
     if wrong or 0 in shape:
         raise ValueError(f"shapes that do not agree: {', '.join(wrong)}")

@@ -33,6 +33,7 @@ from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import changed_parts, fingerprint, open_chain, write_chain
 from bayesfred.sampling.checkpoints import Checkpoints, in_memory
 from bayesfred.sampling.ensembles import Step, adapted, advance, begin, check_start
+from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.stopping import burn_in, checks, sufficient
 
 __all__ = ["Run", "sample", "searching", "versions"]
@@ -54,6 +55,7 @@ def sample(
     resume: bool = False,
     overwrite: bool = False,
     progress: bool = True,
+    record: RunRecord | None = None,
 ) -> Chain:
     """Draw from a posterior, in memory or into a chain file.
 
@@ -83,6 +85,9 @@ def sample(
         Replace the file.
     progress : bool
         Show a progress bar on standard error.
+    record : RunRecord, optional
+        What the chain keeps of the run beside its draws; a resumed run keeps the one it has unless
+        another is given.
 
     Returns
     -------
@@ -122,7 +127,7 @@ def sample(
         if found is None:
             with searching() if progress else nullcontext():
                 found = find_map(posterior)
-        return Run(posterior, found, seed, ensembles=ensembles, walkers=walkers)
+        return Run(posterior, found, seed, ensembles=ensembles, walkers=walkers, record=record)
 
     with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin and take half the cores
         if path is None:
@@ -144,7 +149,7 @@ def sample(
             if may_write(path, resume=resume, overwrite=overwrite):
                 chain = open_chain(path)
                 _check_same(path, fingerprint(chain.posterior()), parts)
-                run = Run.resumed(posterior, chain)
+                run = Run.resumed(posterior, replace(chain, record=record or chain.record))
             else:
                 run = fresh()
             checkpoints = Checkpoints(lambda chain: write_chain(replace(chain, path=path)))
@@ -202,6 +207,8 @@ class Run:
         Of a run without steps. Its walkers start at draws of the Laplace approximation.
     steps : sequence of Step
         The steps that were made already.
+    record : RunRecord, optional
+        Kept with the chain.
     """
 
     def __init__(
@@ -213,6 +220,7 @@ class Run:
         ensembles: int = 4,
         walkers: int = 32,
         steps: Sequence[Step] = (),
+        record: RunRecord | None = None,
     ) -> None:
         expected = len(posterior.parameter_names)
         if np.shape(estimate.params) != (expected,):
@@ -220,7 +228,12 @@ class Run:
                 f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
                 "this posterior's maximum"
             )
+        if record is not None and record.truth is not None and record.truth.shape != (expected,):
+            raise InputError(
+                f"record: got a truth of {record.truth.size} parameters, expected {expected}"
+            )
         self.posterior, self.estimate, self.seed = posterior, estimate, seed
+        self.record = record
         self.near = posterior.near(estimate.params, estimate.covariance)
         self.steps = list(steps)
         self.start = steps[-1] if steps else begin(self.near, estimate, seed, ensembles, walkers)
@@ -236,7 +249,7 @@ class Run:
                 chain.chain.swapaxes(0, 1), chain.log_prob.swapaxes(0, 1), strict=True
             )
         ]
-        return cls(posterior, chain.estimate, chain.seed, steps=steps)
+        return cls(posterior, chain.estimate, chain.seed, steps=steps, record=chain.record)
 
     def until(
         self, target_ess: float, steps: int | None, checkpoints: Checkpoints, *, show: bool
@@ -297,6 +310,7 @@ class Run:
             versions=versions(),
             target_ess=target_ess,
             n_invalid=last.n_invalid,
+            record=self.record,
         )
 
 

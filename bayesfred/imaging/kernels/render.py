@@ -56,10 +56,12 @@ def add_source(layout, s, rows, flux, canvas, alone):
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def add_templates(layout, s, flux, stamps):
+def add_templates(layout, s, flux, stamps, wider):
     """Add K, F X and F Y of source s to its rows of `stamps`, shape (3, samples).
 
-    X = -p_a |D| is K's derivative as the source moves along a, Y along b.
+    X = -p_a |D| is K's derivative as the source moves along a, Y along b. `wider` is None or where
+    F dK/dln(sigma) is added, F (a X + b Y - 2 K) because p is homogeneous of degree -2 in a, b and
+    sigma.
     """
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
     source = one_source(layout.geometry, s)
@@ -72,6 +74,7 @@ def add_templates(layout, s, flux, stamps):
         t_low = (fp.low[i] - 0.5 * (o.nx - 1)) * step - source.u
         first, last = fp.start[i], fp.start[i + 1]
         row, row_a, row_b = stamps[0, first:last], stamps[1, first:last], stamps[2, first:last]
+        row_s = None if wider is None else wider[first:last]
         for y in range(offsets.size):
             map_on_row(source, w + offsets[y], work, degrees.ab)
             for x in range(offsets.size):
@@ -91,6 +94,8 @@ def add_templates(layout, s, flux, stamps):
                     row[n] += k * abs(j)
                     row_a[n] += flux * inverse * k_a * abs(j)
                     row_b[n] += flux * inverse * k_b * abs(j)
+                    if wider is not None:
+                        row_s[n] += flux * (inverse * (a * k_a + b * k_b) - 2.0 * k) * abs(j)
 
 
 @entry()

@@ -66,7 +66,7 @@ def _make_templates(cluster, s, flux):
     first, last = fp.first[s], fp.first[s + 1]
     stamps[:, fp.start[first] : fp.start[last]] = 0.0
     if stamps.shape[0] > 1:
-        add_templates(cluster.layout, s, flux, stamps)
+        add_templates(cluster.layout, s, flux, stamps, None)
     else:
         canvas = Canvas(stamps[0], fp.start)
         add_source(cluster.layout, s, (first, last), 1.0, canvas, None)

@@ -15,12 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 from numba.extending import overload
+from scipy.special import ndtr
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.io.serialize import serializable
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
+from bayesfred.model.noise.poisson import poisson_cdf
 from bayesfred.model.noise.protocol import Noise
 
 
@@ -176,6 +178,12 @@ class GaussianNoise(_Gaussian):
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
         return np.ones_like(mean) / self.variance
 
+    def cumulative(
+        self, counts: Floats, mean: Floats, background: float | Floats, grain: float
+    ) -> tuple[Floats, Floats]:
+        r, sd = counts - mean, np.sqrt(self.variance)
+        return ndtr((r - 0.5 * grain) / sd), ndtr((r + 0.5 * grain) / sd)
+
 
 @serializable("noise.background")
 @dataclass(frozen=True)
@@ -211,6 +219,17 @@ class BackgroundNoise(_Gaussian):
 
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
         return np.ones_like(mean) / background
+
+    def cumulative(
+        self, counts: Floats, mean: Floats, background: float | Floats, grain: float
+    ) -> tuple[Floats, Floats]:
+        """Of the Poisson counts of the background, which are integers but for errors of the fit."""
+        n = counts - mean + background
+        return poisson_cdf(n - 0.5, background), poisson_cdf(n + 0.5, background)
+
+    def deviance_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        """Of counts that are Poisson, not Gaussian."""
+        return (2.0 + 1.0 / background) * np.ones_like(mean)
 
     def pearson_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Of counts that are Poisson, fitted as a Gaussian: see `optimize/fit_statistics`."""

@@ -5,9 +5,9 @@ They are integrals over the counts n of the density p(n | mu) of `poisson_gaussi
     I = E (d log p / d mu)^2,    D(n; mu) = 2 (sup_mu log p(n | mu) - log p(n | mu)),
 
 by the trapezoidal rule, which for these analytic functions errs by less than 1e-6 at the steps used
-here. A table holds them for some read noises r, 10 % apart, as cubic splines over log mu; between
+here. A table holds them for some read noises r, 10 % apart, as cubic splines over log mu. Between
 two of its rows they are interpolated in log r. The relative error is below 1e-4 for a single r, and
-below 2e-3 between rows. Far above the table they approach those of a Gaussian as 1 / (mu + r^2) falls.
+below 2e-3 between rows. Far above the table they approach those of a Gaussian like 1 / (mu + r^2).
 The supremum is at mu = 0 for n <= 1/2, where the score at mu = 0 is negative.
 """
 
@@ -19,8 +19,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from bayesfred._typing import Floats
-from bayesfred.model.noise.poisson_gaussian import left_out
-from bayesfred.model.noise.read_noise import (
+from bayesfred.model.kernels.poisson_gaussian import left_out
+from bayesfred.model.kernels.read_noise import (
     CELLS,
     InformationRows,
     ReadNoiseTerms,
@@ -115,9 +115,7 @@ class MomentTable:
 
 def moment_table(read_noise: float | Floats) -> MomentTable:
     """The table for the range of some read noises."""
-    low, high = (
-        float(np.clip(end(read_noise), SMALLEST, LARGEST)) for end in (np.min, np.max)
-    )
+    low, high = (float(np.clip(end(read_noise), SMALLEST, LARGEST)) for end in (np.min, np.max))
     rows = 1 + math.ceil(math.log(high / low) / ROW_STEP)
     return _table(low, high, rows)
 
@@ -168,7 +166,8 @@ def _moments(means: Floats, r: float) -> Floats:
 def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     """The compiled half for a frame of padded rows."""
     terms = _terms(read_noise)
-    return terms._replace(level=level_series(terms, values))
+    series = level_series(terms, values)
+    return ReadNoiseTerms(*terms[:-1], series)
 
 
 def _terms(read_noise: float | Floats) -> ReadNoiseTerms:

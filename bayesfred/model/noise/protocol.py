@@ -52,7 +52,7 @@ class Noise(Protocol):
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
         """Expected information about the mean."""
 
-    def variance(self, mean: Floats, background: float | Floats) -> Floats:
+    def counts_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Variance of the counts."""
         return np.asarray(1.0 / self.fisher_weight(mean, background))
 
@@ -62,7 +62,7 @@ class Noise(Protocol):
 
     def residual(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         """(counts - mean) in standard deviations."""
-        return np.asarray((counts - mean) / np.sqrt(self.variance(mean, background)))
+        return np.asarray((counts - mean) / np.sqrt(self.counts_variance(mean, background)))
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         """Unit deviance, twice the log-likelihood lost by a mean that is not the counts."""
@@ -74,6 +74,20 @@ class Noise(Protocol):
         """Mean and variance of the unit deviance if the model is true, and the mean's slope."""
         ones = np.ones_like(mean)
         return ones, self.pearson_variance(mean, background), 0.0 * ones
+
+    def cumulative(
+        self, counts: Floats, mean: Floats, background: float | Floats, grain: float
+    ) -> tuple[Floats, Floats] | None:
+        """Probabilities of fewer counts than these, and of these or fewer.
+
+        Counts come in steps of `grain`, of which a continuous distribution has the interval around
+        each. None where the model does not say.
+        """
+        return None
+
+    def deviance_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        """Variance of the unit deviance for a background that is known."""
+        return self.deviance_moments(mean, background)[1]
 
     def pearson_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Variance of a squared residual, less what a fitted background explains of it."""

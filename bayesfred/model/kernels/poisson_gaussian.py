@@ -5,17 +5,18 @@ A pixel's n = k + e has k ~ Poisson(mu) and e ~ N(0, r^2), so that with theta = 
     p(n | mu) = sum_k Poisson(k; mu) N(n - k; r^2) = exp(-mu - n^2 / 2 r^2 + g(theta + n / r^2)).
 
 The function g is the logarithm of sum_k exp(k t - k^2 / 2 r^2) / k!. Its first three derivatives
-are the cumulants of k given n: with G1, G2 and G3 the score is G1 / mu - 1, the weight W = -d score
-/ d mu is (G1 - G2) / mu^2, and C = -1/2 dW / d mu is (G3 - 3 G2 + 2 G1) / 2 mu^3. All zeros of exp(g)
-as a function of mu are real and negative, so log p is concave in mu.
+G1, G2, G3 are the cumulants of k given n. The score is G1 / mu - 1, the weight W = -d score / d mu
+is (G1 - G2) / mu^2, and C = -1/2 dW / d mu is (G3 - 3 G2 + 2 G1) / 2 mu^3. As a function of mu all
+zeros of exp(g) are real and negative, so log p is concave in mu.
 
-Few photons a step (r < 1): the sum itself. Of the k around n, `REACH` on either side are taken. The
-ratio of successive terms is exp((n - k - 1/2) / r^2) mu / (k + 1), so the sum is a polynomial in mu,
-written with a common denominator that depends on n alone. Terms left out change log p by less than
-2e-6 within 6 standard deviations of n.
+Read noise below 1: the sum itself. Of the k around n, `REACH` on either side are taken. The ratio
+of successive terms is exp((n - k - 1/2) / r^2) mu / (k + 1), so the sum is a polynomial in mu,
+written with a common denominator that depends on n alone. Within 6 standard deviations of the mean
+the error of log p is below 1e-9, and within 15 below 1: there n is so far above a small mean that
+the likely k are out of reach.
 
-Otherwise (r >= 1): tilting by exp(s n) turns the distribution into one of the same kind with
-mean y = mu exp(s). If s is chosen so that this mean is n,
+Read noise from 1 on: tilting by exp(s n) turns the distribution into one of the same kind with mean
+y = mu exp(s). If s is chosen so that the tilted mean of n is n itself,
 
     y + r^2 log(y / mu) = n,    log p = y - mu + s (r^2 s / 2 - n) + log phi(y),    s = log(y / mu),
 
@@ -24,10 +25,10 @@ without approximation, where phi(y) is the density of Poisson(y) + N(0, r^2) at 
 
     log phi = -1/2 log(2 pi v) + q (rho / 8 - 5 rho^2 / 24) + ...,
 
-and `CORRECTION` is a polynomial that goes on to q^4. It was fitted to the sum, from which it differs
-by less than 1e-5 for r >= 1 and any y. In terms of omega(x) + log omega(x) = x the mean is y = r^2
-omega(log(mu / r^2) + n / r^2): a table of omega gives s to 2e-3, and a step of Newton's method with
-its second-order term makes that 1e-8.
+and `CORRECTION` is a polynomial that goes on to q^4. It was fitted to the sum, from which it
+differs by less than 1e-5 for any y. The mean is y = r^2 omega(log(mu / r^2) + n / r^2), where omega
++ log omega = x. A table of omega gives s to 2e-3, and a step of Newton's method with its
+second-order term makes that 1e-8.
 
 References
 ----------
@@ -71,8 +72,8 @@ def _correction_table() -> Floats:
     for i, row in enumerate(CORRECTION):
         in_tau = np.polynomial.Polynomial([0.0, *row])(np.polynomial.Polynomial([1.0, -1.0])).coef
         for n in range(4):
-            j = np.arange(in_tau.size)
-            out[n, i, j] = in_tau * (i + 1.0 + j) ** n
+            power = np.arange(in_tau.size, dtype=np.float64) + (i + 1)
+            out[n, i, : in_tau.size] = np.asarray(in_tau, dtype=float) * power**n
     return out
 
 
@@ -242,8 +243,8 @@ def _tilted_density(n, mu, variance):
 def _tilted_derivatives(n, mu, variance):
     """Score, weight and C of the saddlepoint expansion.
 
-    The cumulants of the photon number given n are derivatives by log mu. With L that derivative and M = q d/dq, L y = y tau and L = -rho
-    tau M for functions of q.
+    The cumulants of the photon number given n are derivatives by log mu. With L that derivative
+    and M = q d/dq, L y = y tau and L = -rho tau M for functions of q.
     """
     mu = max(mu, TINY)
     s, y, q = _tilt(n, mu, variance)

@@ -4,9 +4,8 @@ The density is that of `poisson_gaussian`. It has no sufficient statistic, so th
 source reaches cannot be summed up by their counts. But where their mean is one level b, the sum of
 log p over a segment of a row is an analytic function of log b, whose nearest singularity is at a
 distance of pi from the real axis. So for levels within a factor of 2 of a typical one it is a
-Chebyshev series of `VALUE_TERMS` terms, to 1e-11 of its size; that of the information has
-`INFORMATION_TERMS`. The pixels that no source reaches are the whole frame less the segments that are
-reached. For other levels they are summed one by one.
+Chebyshev series of `VALUE_TERMS` terms, to 1e-11 of its size. That of the information has
+`INFORMATION_TERMS`. At other levels the pixels are summed one by one.
 """
 
 import math
@@ -22,7 +21,7 @@ from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
 from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
-from bayesfred.model.noise.poisson_gaussian import density_of, derivatives_of, kind_of
+from bayesfred.model.kernels.poisson_gaussian import density_of, derivatives_of, kind_of
 
 VALUE_TERMS = 12
 INFORMATION_TERMS = 6
@@ -60,18 +59,22 @@ class ReadNoiseTerms(NamedTuple):
 
     @staticmethod
     def log_density(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+        """log p less what depends on n alone."""
         return density_of(noise.kind, n, mu, _at(noise.variance, p)) if mu >= 0.0 else MASKED
 
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+        """Score, weight and C."""
         return derivatives_of(noise.kind, n, mu, _at(noise.variance, p))
 
     @staticmethod
     def information(noise: Any, mu: Any, p: Any) -> Any:
+        """The expectation of the weight."""
         return _information(noise, mu, _at(noise.variance, p), _at(noise.row, p))
 
     @staticmethod
     def unreached(noise: Any, rest: Any, level: Any) -> Any:
+        """Sums over the pixels that no source reaches."""
         return _unreached(noise, rest, level)
 
 
@@ -262,7 +265,9 @@ def level_series(noise: ReadNoiseTerms, values: Floats) -> LevelSeries:
     return LevelSeries(middle, series, series.sum(axis=0), flat)
 
 
-def new_terms(variance: float | Floats, rows: InformationRows, row: float | Floats) -> Any:
+def new_terms(
+    variance: float | Floats, rows: InformationRows, row: float | Floats
+) -> ReadNoiseTerms:
     """The compiled half for pixels in the order in which they are given, without a frame."""
     none = np.empty((0, 0))
     level = LevelSeries(0.0, none, none.ravel(), none.ravel())

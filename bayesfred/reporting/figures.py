@@ -1,0 +1,251 @@
+"""The figures of a page: which there are, what is said below them, and what they show in words.
+
+An alternative text says with numbers what a reader sees in the figure. The figures themselves are
+those of `bayesfred.reporting.frames` and `bayesfred.reporting.posteriors`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bayesfred._typing import Floats
+from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.model.posterior import Posterior
+from bayesfred.reporting.frames import MAX_STARS, FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.goodness import described_residuals, residual_panels
+from bayesfred.reporting.posteriors import corner_plot, marginal_plot, trace_plot
+from bayesfred.sampling.chain import Chain
+
+__all__ = ["PageFigure", "described_residual", "page_figures"]
+
+BEYOND = 3.0  # standard deviations; a normal residual is beyond with a probability of 0.27 %
+
+
+class PageFigure(NamedTuple):
+    """A figure of the page.
+
+    Attributes
+    ----------
+    heading, caption : str
+        What stands above and below it.
+    alternative : str
+        What is seen in it, for those who do not see it.
+    figure : Figure
+    """
+
+    heading: str
+    caption: str
+    alternative: str
+    figure: Figure
+
+
+def page_figures(
+    fitted: FittedFrame,
+    chain: Chain,
+    diagnostics: Diagnostics,
+    *,
+    shown: Sequence[int],
+    truth: Floats | None = None,
+) -> list[PageFigure]:
+    """The figures of a run's page.
+
+    Parameters
+    ----------
+    fitted : FittedFrame
+        The frame with the model at the MAP.
+    chain : Chain
+    diagnostics : Diagnostics
+        What `diagnose` said of `chain`.
+    shown : sequence of int
+        Indices of the parameters that are shown in pairs; the others have histograms.
+    truth : ndarray, shape (d,), parameter units, optional
+        Values that a simulation used.
+
+    Returns
+    -------
+    list of PageFigure
+    """
+    posterior = chain.posterior()
+    u, v, half_width = _star_positions(chain, posterior)
+    return [
+        PageFigure(
+            "Frame, model and residual",
+            "At the MAP. Green pixels do not enter the likelihood.",
+            f"{_described_frame(fitted)} {described_residual(fitted)}",
+            frame_triptych(fitted),
+        ),
+        PageFigure(
+            "Brightest sources",
+            "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced "
+            "source.",
+            _described_stars(fitted, u, v),
+            star_panels(fitted, u, v, half_width=half_width),
+        ),
+        *_residual_figures(diagnostics, posterior),
+        *_posterior_figures(chain, shown, truth),
+        PageFigure(
+            "Chain",
+            "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, flat "
+            "at 1 when all ensembles sample one distribution.",
+            _described_chain(chain, diagnostics),
+            trace_plot(chain, posterior.parameters),
+        ),
+    ]
+
+
+def _residual_figures(diagnostics: Diagnostics, posterior: Posterior) -> list[PageFigure]:
+    """What the residuals show, of a posterior of a frame."""
+    if diagnostics.residuals is None:
+        return []
+    return [
+        PageFigure(
+            "Residuals",
+            "Their distribution beside that of a true model, the displacement of the sources "
+            "against the position of their images within a pixel, and every source's chi-square.",
+            described_residuals(diagnostics.residuals),
+            residual_panels(diagnostics.residuals, posterior.model.detector.shape),
+        )
+    ]
+
+
+def _posterior_figures(
+    chain: Chain, shown: Sequence[int], truth: Floats | None
+) -> list[PageFigure]:
+    """Pairs of the parameters that are shown so, and histograms of the others."""
+    draws, posterior = chain.draws(), chain.posterior()
+    rest = [k for k in range(draws.shape[1]) if k not in shown]
+
+    def part(which: Sequence[int], values: Floats | None) -> Floats | None:
+        return None if values is None else values[list(which)]
+
+    def marks(which: Sequence[int]) -> dict[str, Floats | None]:
+        return {"truth": part(which, truth), "estimate": part(which, chain.estimate.params)}
+
+    caption = "Contours hold 39 % and 86 % of the draws."
+    if rest:
+        caption += (
+            f" {len(shown)} of {draws.shape[1]} parameters; `report --corner NAME,NAME,...` shows "
+            "others."
+        )
+    figures = [
+        PageFigure(
+            "Posterior",
+            caption,
+            _described_pairs(draws, chain.parameter_names, shown),
+            corner_plot(
+                draws[:, list(shown)], [posterior.parameters[k] for k in shown], **marks(shown)
+            ),
+        )
+    ]
+    if rest:
+        names = [chain.parameter_names[k] for k in rest]
+        figures.append(
+            PageFigure(
+                "Posterior: other parameters",
+                "Draws, and the density of the prior: next to zero where the prior is much wider.",
+                _described_marginals(draws[:, rest], names, posterior),
+                marginal_plot(
+                    draws[:, rest], [posterior.parameters[k] for k in rest], posterior.prior,
+                    **marks(rest),
+                ),
+            )
+        )  # fmt: skip
+    return figures
+
+
+def described_residual(fitted: FittedFrame) -> str:
+    """Say what is seen in an image of residuals.
+
+    Parameters
+    ----------
+    fitted : FittedFrame
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> ones = np.ones((2, 2))
+    >>> described_residual(FittedFrame(ones + 4 * np.eye(2), ones, ones, ones > 0))
+    'Residuals between 0.0 and 4.0 standard deviations; 50.00 % of 4 pixels are beyond 3, ...'
+    """
+    residual = fitted.residual()[fitted.mask]
+    if not residual.size:
+        return "No pixel is used."
+    beyond = np.mean(np.abs(residual) > BEYOND)
+    return (
+        f"Residuals between {residual.min():.1f} and {residual.max():.1f} standard deviations; "
+        f"{100 * beyond:.2f} % of {residual.size} pixels are beyond {BEYOND:.0f}, where normal "
+        "residuals would have 0.27 %."
+    ).replace("-", "−")
+
+
+def _described_frame(fitted: FittedFrame) -> str:
+    ny, nx = fitted.counts.shape
+    counts, expected = fitted.counts[fitted.mask], fitted.expected[fitted.mask]
+    if not counts.size:
+        return f"A frame of {ny} × {nx} pixels."
+    return (
+        f"A frame of {ny} × {nx} pixels with {counts.min():.4g} to {counts.max():.4g} counts a "
+        f"pixel, beside a model with {expected.min():.4g} to {expected.max():.4g}."
+    )
+
+
+def _described_stars(fitted: FittedFrame, u: Floats, v: Floats) -> str:
+    ny, nx = fitted.counts.shape
+    inside = int(np.sum((np.abs(u) <= nx / 2) & (np.abs(v) <= ny / 2)))
+    number = min(inside, MAX_STARS)
+    which = (
+        f"the {number} brightest of {inside} sources" if inside > number else f"{number} sources"
+    )
+    return f"Counts, model and residual side by side around {which} in the frame."
+
+
+def _described_pairs(draws: Floats, names: Sequence[str], shown: Sequence[int]) -> str:
+    text = f"Histograms of {len(shown)} parameters and contours of their pairs."
+    if len(shown) < 2:
+        return text
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.atleast_2d(np.nan_to_num(np.corrcoef(draws[:, list(shown)].T)))
+    i, j = divmod(int(np.argmax(np.abs(np.triu(correlation, 1)))), len(shown))
+    number = f"{correlation[i, j]:+.2f}".replace("-", "−")
+    return (
+        f"{text} The strongest correlation is {number}, of {names[shown[i]]} and {names[shown[j]]}."
+    )
+
+
+def _described_marginals(draws: Floats, names: Sequence[str], posterior: Posterior) -> str:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = draws.std(axis=0) / np.array([posterior.prior[name].std() for name in names])
+    widest = int(np.argmax(np.nan_to_num(ratio, posinf=0.0)))
+    return (
+        f"Histograms of {len(names)} parameters with their priors. At most a posterior is "
+        f"{ratio[widest]:.2g} times as wide as its prior, that of {names[widest]}."
+    )
+
+
+def _described_chain(chain: Chain, diagnostics: Diagnostics) -> str:
+    ensembles, steps, walkers, d = chain.chain.shape
+    worst, rhat = max(diagnostics.rhat.items(), key=lambda item: item[1])
+    return (
+        f"Traces and rank histograms of {d} parameters: {ensembles} ensembles of {walkers} walkers "
+        f"over {steps} steps, the first {chain.burn_in} of them burn-in. Ensembles differ most in "
+        f"{worst}, with an R-hat of {rhat:.3f}."
+    )
+
+
+def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats, int]:
+    """Images of the sources in recorded pixels from the middle, and a stamp's half-width."""
+    model = posterior.model
+    params = dict(zip(chain.parameter_names, chain.estimate.params, strict=True))
+    theta = chain.estimate.params[: model.distortion.n_terms]
+    x = model.sources.x + params.get("offset_x", 0.0)
+    y = model.sources.y + params.get("offset_y", 0.0)
+    u, v = model.distortion.image_position(theta, x, y)
+    binning = model.detector.binning
+    half_width = max(4, math.ceil(3.5 * params.get("psf_sigma", model.psf.sigma) / binning))
+    return u / binning, v / binning, half_width
