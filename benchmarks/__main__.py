@@ -184,6 +184,11 @@ def main() -> int:
     def exp() -> object:
         return np.exp(x, out=out)
 
+    def read_noise(value: object) -> Callable[[], object]:
+        noise = bf.PoissonNoise(value)
+        noisy = bf.Posterior(m, bf.simulate(m, THETA, 5.0, seed=1, noise=noise), noise=noise)
+        return with_threads(1, lambda: noisy.log_prob(truth))
+
     # the same sources in four times the empty frame, their pixels within the smaller one too
     inner, outer = (
         bf.Posterior(e, bf.simulate(e, THETA, 5.0, seed=1))
@@ -233,6 +238,18 @@ def main() -> int:
             "log-posterior per walker / np.exp",
             ratio(with_threads(1, lambda: posterior.log_prob(truth)), one, 40),
             2.2,
+        ),
+        *(
+            (
+                f"log-posterior, read noise {name} / none",
+                ratio(read_noise(value), with_threads(1, lambda: posterior.log_prob(truth)), 40),
+                1.5,
+            )
+            for name, value in (
+                ("0.5", 0.5),
+                ("2", 2.0),
+                ("of a map", np.full(m.detector.shape, 2.0)),
+            )
         ),
         (
             "32 walkers, 2 threads / 1 thread",

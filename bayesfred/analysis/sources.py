@@ -237,7 +237,7 @@ def _sum_up(
         n, mu = counts[pixel], expected[pixel]
         noise = posterior.noise.at(np.unravel_index(pixel, posterior.counts.shape))
         with np.errstate(all="ignore"):  # what is not finite is said so
-            w = noise.fisher_weight(mu, level)
+            w = 1.0 / noise.counts_variance(mu, level)
             mean, _, slope = noise.deviance_moments(mu, level)
             variance = noise.deviance_variance(mu, level)
             deviance = noise.deviance(n, mu, level)

@@ -21,7 +21,8 @@ from h5py import h5a, h5d, h5l, h5o, h5t, h5z
 from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
-SCHEMA = 3
+SCHEMA = 4
+READABLE = (3, 4)  # schema 3 means the shifted Poisson by read noise; see `sampling/chainfile`
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 
@@ -117,7 +118,7 @@ def _check_seal(stream: BinaryIO) -> int:
 
 
 def _check_schema(kind: Any, schema: Any) -> None:
-    if kind == KIND and schema == SCHEMA:
+    if kind == KIND and schema in READABLE:
         return
     later = bool(kind == KIND and schema > SCHEMA)
     remedy = "read it with the version that wrote it" if later else "remake it with this version"

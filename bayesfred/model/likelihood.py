@@ -196,7 +196,7 @@ class FrameLikelihood:
             frame = self.mask, w.image.reshape(self.mask.shape[0], -1)
             own = own_pixels(optics, parameters, (fluxes, shifts), radius, frame)
             sources = frame[1][:, : self.mask.shape[1]].copy()
-        level = self._background(parameters.background) - self.noise.shift
+        level = self._background(parameters.background)
         return own, sources + level, fluxes, shifts
 
     def simulate(self, params: Floats, rng: np.random.Generator) -> Floats | None:
@@ -224,7 +224,7 @@ class FrameLikelihood:
             moved = optics._replace(x=optics.x + by_x, y=optics.y + by_y)
             render_sources(moved, theta, at_rest, flux, out)
         sources = out.reshape(ny, -1)[:, :nx]
-        level = self._background(background) - self.noise.shift
+        level = self._background(background)
         if not (unfolded and np.all((sources + level)[self.mask] >= 0.0)):
             return None
         return self.noise.draw(sources, np.maximum(level, -sources), rng)
@@ -234,7 +234,7 @@ class FrameLikelihood:
         with self._rendered(params) as (w, rendered, parameters):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
         bad = 0.0 if rendered.extra > -np.inf else np.nan
-        level = self._background(parameters.background) - self.noise.shift
+        level = self._background(parameters.background)
         return sources + level + bad, rendered.fluxes + bad
 
     def _background(self, background: Floats) -> Floats:
@@ -255,7 +255,6 @@ class FrameLikelihood:
             if parameter.kind != "distortion":
                 values = source if parameter.kind == "source" else background
                 values[:, parameter.slot] = vectors[:, k]
-        background[:, 0] += self.noise.shift
         theta = distortion.monomial_coefficients(vectors[:, : distortion.n_terms])
         return Vectors(np.ascontiguousarray(theta), source, background)
 
@@ -340,7 +339,7 @@ class FrameLikelihood:
     def _frame(self) -> Frame:
         ny, nx = self.model.detector.shape
         values = np.full((ny, stride(nx)), MASKED)
-        values[:, :nx] = np.where(self.mask, self.counts + self.noise.shift, MASKED)
+        values[:, :nx] = np.where(self.mask, self.counts, MASKED)
         used = (values > LIMIT).reshape(-1, SEGMENT)
         total = np.where(used, values.reshape(-1, SEGMENT), 0.0).sum(axis=1)
         noise, varies = self.noise.terms(values), self.nuisances.background_order > 0

@@ -252,7 +252,7 @@ class Posterior(TargetDensity):
     def sigma(self, params: npt.ArrayLike) -> Floats:
         """Standard deviation of every pixel's counts under the noise model, shape (ny, nx)."""
         level = self._vector(params)[self.parameter_names.index("background")]
-        return np.asarray(self.noise.fisher_weight(self.expected_counts(params), level) ** -0.5)
+        return np.sqrt(self.noise.counts_variance(self.expected_counts(params), level))
 
     def fluxes(self, params: npt.ArrayLike) -> Floats:
         """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""

@@ -155,8 +155,8 @@ class _Residuals:
         light = np.zeros(p.counts.shape)
         mask, near = p.mask, 2 * int(np.ceil(3.0 * s)) + 1
         for _ in range(LOOKS):
-            weight = p.noise.fisher_weight(expected + np.maximum(light, 0.0), self.level)
-            variance = ndimage.gaussian_filter(np.where(p.mask, 1.0 / weight, 0.0), s)
+            each = p.noise.counts_variance(expected + np.maximum(light, 0.0), self.level)
+            variance = ndimage.gaussian_filter(np.where(p.mask, each, 0.0), s)
             limit = SIGNIFICANCE * np.sqrt(variance / (2.0 * np.pi * s**6))
             limit += SIGNIFICANCE**2 / self.height
             if tolerance:
@@ -178,7 +178,9 @@ class _Residuals:
             light += self._image(positions[absent < 0], flux[absent < 0])
             wider = 2 * int(np.ceil(0.25 * s)) + 1  # for detections of another width
             spread = ndimage.maximum_filter(np.abs(light), wider)
-            mask = p.mask & (spread <= FAINT * p.noise.fisher_weight(expected, self.level) ** -0.5)
+            mask = p.mask & (
+                spread <= FAINT * np.sqrt(p.noise.counts_variance(expected, self.level))
+            )
             if self.too_many(missing | ~mask[self.row, self.column]):
                 break
         return missing, mask

@@ -37,8 +37,8 @@ def find_peaks(posterior: Posterior) -> Floats:
     total = binned(np.where(posterior.mask, posterior.counts, 0.0))
     level = float(np.median(total[used > 0] / used[used > 0])) if used.any() else 0.0
     filled = np.where(posterior.mask, posterior.counts, level)
-    weight = posterior.noise.fisher_weight(np.maximum(filled, 1e-9), max(level, 1e-9))
-    variance = ndimage.gaussian_filter(binned(1.0 / weight), s) / (2.0 * np.pi * s**6)
+    each = posterior.noise.counts_variance(np.maximum(filled, 1e-9), max(level, 1e-9))
+    variance = ndimage.gaussian_filter(binned(each), s) / (2.0 * np.pi * s**6)
     filtered = -ndimage.gaussian_laplace(binned(filled), s)
     peak = filtered == ndimage.maximum_filter(filtered, 3)
     peak &= filtered > SIGNIFICANCE * np.sqrt(variance)

@@ -139,7 +139,23 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
         write_array(group, name, values)
 
 
+def _refuse_shifted_poisson(file: h5py.File) -> None:
+    """Raise InputError for a chain whose read noise is the shifted Poisson of schema 3.
+
+    Its log-probabilities are those of another model than the one that would be read.
+    """
+    noise = file["posterior/noise"].attrs
+    shifted = noise["kind"] == b"noise.poisson" and noise["read_noise"] > 0.0
+    if shifted and file.attrs["schema"] < SCHEMA:
+        raise InputError(
+            f"noise: got read noise {noise['read_noise']:g} as the shifted Poisson distribution "
+            f"(schema {file.attrs['schema']}), expected the convolution with a Gaussian that has "
+            "replaced it: sample the frame again"
+        )
+
+
 def _read(path: Path, file: h5py.File) -> Chain:
+    _refuse_shifted_poisson(file)
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     chain = Chain(
         path=path,

@@ -18,8 +18,7 @@ LIMIT = -1e299
 class Frame(NamedTuple):
     """The counts as the loops need them.
 
-    Rows are padded to `stride`, pixels outside the likelihood are MASKED. The noise's shift is in
-    the values, and on every call in the constant background.
+    Rows are padded to `stride`, pixels outside the likelihood are MASKED.
     """
 
     values: Floats  # (ny * stride,)

@@ -1,8 +1,8 @@
 """What the loops ask of a noise model, answered at compile time by its type.
 
 The compiled half of a noise model is a named tuple class. Its fields are numbers and arrays; its
-static methods are compiled into the loops. Counts n and mean mu have `Noise.shift` added. p is the
-pixel's place in the frame's padded, flattened rows. A model has
+static methods are compiled into the loops. n are counts and mu is their mean. p is the pixel's
+place in the frame's padded, flattened rows. A model has
 
     log_density(noise, n, mu, p)      log-density, up to what depends on the counts alone; MASKED
                                       or less where mu is impossible

@@ -1,4 +1,4 @@
-"""Photon noise."""
+"""Photon noise, alone or with the read noise of `poisson_gaussian`."""
 
 import math
 from dataclasses import dataclass
@@ -15,6 +15,16 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.kernels.fastmath import log
 from bayesfred.io.serialize import serializable
 from bayesfred.model.kernels.contexts import MASKED
+from bayesfred.model.kernels.poisson_gaussian import left_out
+from bayesfred.model.kernels.read_noise import ReadNoiseTerms
+from bayesfred.model.noise.moments import (
+    deviance,
+    frame_terms,
+    information,
+    log_likelihood,
+    moment_table,
+    score,
+)
 from bayesfred.model.noise.protocol import Noise
 
 NOTHING = 1e-300  # stands for an expected count of zero, at which nothing but zero can be counted
@@ -56,80 +66,149 @@ class PoissonTerms(NamedTuple):
 
 
 @serializable("noise.poisson")
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoissonNoise(Noise):
-    """Photon noise, with read noise as the shifted Poisson distribution.
+    """Photon noise, and Gaussian read noise.
 
-    Counts are Poisson(mean). Gaussian read noise of variance r^2 is matched in mean and variance by
-    treating counts + r^2 as Poisson(mean + r^2). Where read noise takes counts below -r^2 the same
-    expression is used, whose score keeps the expectation zero.
+    Counts are Poisson(mean) without read noise, and with it the sum of such a number and a normal
+    one: their density is the convolution of the two distributions. Counts are electrons, so that
+    a gain map is applied to the frame (counts = (adu - pedestal) * gain) and to the read noise
+    (electrons = adu * gain) before they are given here.
 
     Parameters
     ----------
-    read_noise : float, counts
-        Standard deviation r of the read noise.
+    read_noise : float or array_like, shape (ny, nx), counts
+        Standard deviation r of the read noise, of all pixels or of each: the square root of a map
+        of read-out variance. In an array every number is positive; give a pixel without one any,
+        and mask it.
 
     Raises
     ------
     InputError
-        If `read_noise` is negative or not finite.
+        If `read_noise` is negative or not finite, or zero in an array.
+
+    References
+    ----------
+    D. L. Snyder, A. M. Hammoud, R. L. White (1993), Journal of the Optical Society of America A 10,
+    1014: image recovery from data acquired with a charge-coupled-device camera.
 
     Examples
     --------
     >>> PoissonNoise().log_likelihood(np.array([0.0]), np.array([2.0]), 2.0)
     array([-2.])
+    >>> PoissonNoise(0.5).log_likelihood(np.array([-0.2, 1.3]), np.array([2.0]), 2.0).round(3)
+    array([-2.095, -1.494])
     """
 
-    read_noise: float = 0.0
+    read_noise: float | Floats = 0.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.read_noise) and self.read_noise >= 0):
+        try:
+            read_noise = np.array(self.read_noise, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise InputError("noise: read_noise: got no numbers, expected counts") from None
+        bad = ~(np.isfinite(read_noise) & (read_noise >= 0.0))
+        if not read_noise.ndim:
+            if bad:
+                raise InputError(
+                    f"noise: read_noise: got {self.read_noise}, expected a standard deviation >= 0 "
+                    "in counts"
+                )
+            object.__setattr__(self, "read_noise", float(read_noise))
+            return
+        bad |= read_noise == 0.0
+        if bad.any():
             raise InputError(
-                f"noise: read_noise: got {self.read_noise}, expected a standard deviation >= 0 in "
-                "counts"
+                f"noise: read_noise: got {read_noise[bad][0]:g} in {bad.sum()} pixels, expected "
+                "positive numbers: mask such pixels and give them any read noise"
             )
+        read_noise.flags.writeable = False
+        object.__setattr__(self, "read_noise", read_noise)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PoissonNoise) and np.array_equal(self.read_noise, other.read_noise)
+
+    def __hash__(self) -> int:
+        return hash(np.asarray(self.read_noise).tobytes())
 
     @property
-    def shift(self) -> float:
+    def _counts_photons(self) -> bool:
+        """Whether there is no read noise."""
+        return isinstance(self.read_noise, float) and self.read_noise == 0.0
+
+    @property
+    def _variance(self) -> float | Floats:
         """Variance of the read noise."""
         return self.read_noise**2
 
-    def terms(self, values: Floats) -> PoissonTerms:
-        return PoissonTerms()
+    def terms(self, values: Floats) -> PoissonTerms | ReadNoiseTerms:
+        if self._counts_photons:
+            return PoissonTerms()
+        if isinstance(self.read_noise, float):
+            return frame_terms(self.read_noise, values)
+        padded = np.full(values.shape, np.median(self.read_noise))
+        padded[:, : self.read_noise.shape[1]] = self.read_noise
+        return frame_terms(padded.ravel(), values)
 
     def constant(self, counts: Floats, used: Flags) -> float:
-        return -float(np.sum(gammaln(np.maximum(counts[used] + self.shift, 0.0) + 1.0)))
+        if self._counts_photons:
+            return -float(np.sum(gammaln(np.maximum(counts[used], 0.0) + 1.0)))
+        variance = np.broadcast_to(self._variance, counts.shape)[used]
+        return float(np.sum(left_out(counts[used], variance)))
 
     def check(self, counts: Floats, used: Flags, flux: str, background_order: int) -> None:
-        if self.read_noise == 0 and counts[used].min() < 0:
+        if np.shape(self.read_noise) not in ((), counts.shape):
+            raise InputError(
+                f"noise: read_noise: got shape {np.shape(self.read_noise)}, expected a number or "
+                f"the frame's shape {counts.shape}"
+            )
+        if self._counts_photons and counts[used].min() < 0:
             raise InputError(
                 f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: "
                 "check gain and pedestal, give read_noise, or mask these pixels"
             )
 
+    def at(self, pixels: Any) -> "PoissonNoise":
+        if isinstance(self.read_noise, float):
+            return self
+        return PoissonNoise(self.read_noise[pixels])
+
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
         counts = rng.poisson(sources + background).astype(np.float64)
-        return (
-            counts + rng.normal(0.0, self.read_noise, counts.shape)
-            if self.read_noise > 0
-            else counts
-        )
+        if self._counts_photons:
+            return counts
+        return counts + rng.normal(0.0, self.read_noise, counts.shape)
 
     def log_likelihood(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        n, mu = counts + self.shift, mean + self.shift
-        return np.asarray(xlogy(n, mu) - mu - gammaln(np.maximum(n, 0.0) + 1.0))
+        if not self._counts_photons:
+            return log_likelihood(counts, mean, self.read_noise)
+        return np.asarray(xlogy(counts, mean) - mean - gammaln(np.maximum(counts, 0.0) + 1.0))
 
     def score(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        return (counts + self.shift) / np.maximum(mean + self.shift, NOTHING) - 1.0
+        if not self._counts_photons:
+            return score(counts, mean, self.read_noise)
+        return counts / np.maximum(mean, NOTHING) - 1.0
 
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
-        return 1.0 / np.maximum(mean + self.shift, NOTHING)
+        if not self._counts_photons:
+            return information(mean, self.read_noise)
+        return 1.0 / np.maximum(mean, NOTHING)
+
+    def counts_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        return np.maximum(mean, NOTHING) + self._variance
+
+    def pearson_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        """Kurtosis of the counts less what the background explains of it; 2 without read noise."""
+        if self._counts_photons:
+            return 2.0 * np.ones_like(mean)
+        inverse = 1.0 / self.counts_variance(mean, background)
+        explained = inverse / self.fisher_weight(mean, background)
+        return 2.0 + inverse * inverse * mean - inverse * explained
 
     def cumulative(
         self, counts: Floats, mean: Floats, background: float | Floats, grain: float
     ) -> tuple[Floats, Floats]:
-        """Of the sum of Poisson counts and Gaussian read noise, not of what stands for it."""
-        if self.read_noise > 0.0:
+        if not self._counts_photons:
             half = 0.5 * grain
             return (
                 blurred_cdf(counts - half, mean, self.read_noise),
@@ -139,15 +218,17 @@ class PoissonNoise(Noise):
         return poisson_cdf(counts - half, mean), poisson_cdf(counts + half, mean)
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        n, mu = counts + self.shift, mean + self.shift
-        # read noise may take counts below zero, where the best mean is zero
-        positive = np.maximum(n, 0.0)
-        return np.asarray(2.0 * (xlogy(positive, positive / mu) - n + mu))
+        if not self._counts_photons:
+            return deviance(counts, mean, self.read_noise)
+        n = counts
+        return np.asarray(2.0 * (xlogy(n, np.maximum(n, 0.0) / mean) - n + mean))
 
     def deviance_moments(
         self, mean: Floats, background: float | Floats
     ) -> tuple[Floats, Floats, Floats]:
-        return deviance_moments(mean + self.shift)
+        if not self._counts_photons:
+            return moment_table(self.read_noise).deviance(mean, self.read_noise)
+        return deviance_moments(mean)
 
 
 def poisson_cdf(n: Floats, mu: float | Floats) -> Floats:
@@ -155,7 +236,7 @@ def poisson_cdf(n: Floats, mu: float | Floats) -> Floats:
     return np.where(n < 0.0, 0.0, pdtr(np.maximum(n, 0.0), mu))
 
 
-def blurred_cdf(x: Floats, mu: Floats, read_noise: float) -> Floats:
+def blurred_cdf(x: Floats, mu: Floats, read_noise: float | Floats) -> Floats:
     """P(N + e <= x) of Poisson counts N and Gaussian read noise e.
 
     The sum over N of P(N) Phi((x - N) / r), over the counts within eight r of x, or where the
@@ -170,20 +251,20 @@ def blurred_cdf(x: Floats, mu: Floats, read_noise: float) -> Floats:
     >>> blurred_cdf(np.array([5.0, 500.0]), np.array([5.0, 500.0]), 2.0).round(4)
     array([0.5441, 0.5059])
     """
-    variance = mu + read_noise**2
-    smooth = (variance >= SMOOTH_FROM) & (read_noise >= BLURRED_FROM)
+    variance, r = mu + read_noise**2, np.broadcast_to(read_noise, np.shape(x))
+    smooth = (variance >= SMOOTH_FROM) & (r >= BLURRED_FROM)
     out = np.empty(np.shape(x))
     m, v = mu[smooth], variance[smooth]
     z, s, k = (x[smooth] - m) / np.sqrt(v), m * v**-1.5, m / v**2
     terms = s * (z**2 - 1.0) / 6.0 + k * (z**3 - 3.0 * z) / 24.0
     terms += s**2 * (z**5 - 10.0 * z**3 + 15.0 * z) / 72.0
     out[smooth] = ndtr(z) - terms * np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
-    x, mu = x[~smooth], mu[~smooth]
-    lowest = np.maximum(np.ceil(x - TAIL * read_noise), 0.0)
+    x, mu, r = x[~smooth], mu[~smooth], r[~smooth]
+    lowest = np.maximum(np.ceil(x - TAIL * r), 0.0)
     total, log_mu = poisson_cdf(lowest - 1.0, mu), np.log(np.maximum(mu, NOTHING))
-    for j in range(math.ceil(2.0 * TAIL * read_noise) + 1):
+    for j in range(math.ceil(2.0 * TAIL * np.max(r, initial=0.0)) + 1):
         n = lowest + j
-        total += np.exp(n * log_mu - mu - gammaln(n + 1.0)) * ndtr((x - n) / read_noise)
+        total += np.exp(n * log_mu - mu - gammaln(n + 1.0)) * ndtr((x - n) / r)
     out[~smooth] = total
     return out
 

@@ -22,11 +22,6 @@ class Noise(Protocol):
     belong to all pixels of the frame, or to those of `at`.
     """
 
-    @property
-    def shift(self) -> float:
-        """What is added to the counts and to the mean before the compiled half sees them."""
-        return 0.0
-
     @abstractmethod
     def terms(self, values: Floats) -> Any:
         """The compiled half for a frame of padded rows, MASKED where a pixel is not used."""
@@ -55,7 +50,11 @@ class Noise(Protocol):
 
     @abstractmethod
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
-        """Expected information about the mean, one over the variance."""
+        """Expected information about the mean."""
+
+    def counts_variance(self, mean: Floats, background: float | Floats) -> Floats:
+        """Variance of the counts."""
+        return np.asarray(1.0 / self.fisher_weight(mean, background))
 
     def score(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         """Derivative of the log-likelihood with respect to the mean."""
@@ -63,7 +62,7 @@ class Noise(Protocol):
 
     def residual(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         """(counts - mean) in standard deviations."""
-        return np.asarray((counts - mean) * np.sqrt(self.fisher_weight(mean, background)))
+        return np.asarray((counts - mean) / np.sqrt(self.counts_variance(mean, background)))
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         """Unit deviance, twice the log-likelihood lost by a mean that is not the counts."""

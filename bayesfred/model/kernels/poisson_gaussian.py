@@ -1,0 +1,318 @@
+"""Photons counted with Gaussian read noise: the convolution of the two distributions.
+
+A pixel's n = k + e has k ~ Poisson(mu) and e ~ N(0, r^2), so that with theta = log(mu)
+
+    p(n | mu) = sum_k Poisson(k; mu) N(n - k; r^2) = exp(-mu - n^2 / 2 r^2 + g(theta + n / r^2)).
+
+The function g is the logarithm of sum_k exp(k t - k^2 / 2 r^2) / k!. Its first three derivatives
+G1, G2, G3 are the cumulants of k given n. The score is G1 / mu - 1, the weight W = -d score / d mu
+is (G1 - G2) / mu^2, and C = -1/2 dW / d mu is (G3 - 3 G2 + 2 G1) / 2 mu^3. As a function of mu all
+zeros of exp(g) are real and negative, so log p is concave in mu.
+
+Read noise below 1: the sum itself. Of the k around n, `REACH` on either side are taken. The ratio
+of successive terms is exp((n - k - 1/2) / r^2) mu / (k + 1), so the sum is a polynomial in mu,
+written with a common denominator that depends on n alone. Within 6 standard deviations of the mean
+the error of log p is below 1e-9, and within 15 below 1: there n is so far above a small mean that
+the likely k are out of reach.
+
+Read noise from 1 on: tilting by exp(s n) turns the distribution into one of the same kind with mean
+y = mu exp(s). If s is chosen so that the tilted mean of n is n itself,
+
+    y + r^2 log(y / mu) = n,    log p = y - mu + s (r^2 s / 2 - n) + log phi(y),    s = log(y / mu),
+
+without approximation, where phi(y) is the density of Poisson(y) + N(0, r^2) at its mean. With v = y
++ r^2, q = 1 / v and rho = y / v the saddlepoint expansion of phi begins
+
+    log phi = -1/2 log(2 pi v) + q (rho / 8 - 5 rho^2 / 24) + ...,
+
+and `CORRECTION` is a polynomial that goes on to q^4. It was fitted to the sum, from which it
+differs by less than 1e-5 for any y. The mean is y = r^2 omega(log(mu / r^2) + n / r^2), where omega
++ log omega = x. A table of omega gives s to 2e-3, and a step of Newton's method with its
+second-order term makes that 1e-8.
+
+References
+----------
+D. L. Snyder, C. W. Helstrom, A. D. Lanterman, M. Faisal, R. L. White (1995), Journal of the Optical
+Society of America A 12, 272: saddlepoint approximation for photon counts with read-out noise.
+H. E. Daniels (1954), Annals of Mathematical Statistics 25, 631: saddlepoint approximations.
+R. M. Corless, D. J. Jeffrey (2002), LNCS 2385, 76: the Wright omega function.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba.extending import overload
+from scipy.special import gammaln, wrightomega
+
+from bayesfred._typing import Floats
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.fastmath import FAST, LOG2_E, as_bits, as_float, exp2, log
+
+REACH = 8  # terms of the sum on either side of n
+WIDE = 1.0  # variance of the read noise from which on the saddlepoint expansion serves
+LEAST = 1e-30  # stands for smaller expected counts in the sum, whose powers must not underflow
+NEGLIGIBLE = 1e-25  # of successive terms, whose products shall not become denormal numbers
+TINY = 1e-200  # ... and in the saddlepoint expansion
+
+# log phi + 1/2 log(2 pi v): coefficients of q^i rho^j, a row for i = 1, 2, 3, 4, from j = 1 on
+CORRECTION = (
+    (1 / 8, -5 / 24),
+    (-0.02682521841400122, 0.29204228366996754, -0.6918377668561361, 0.4434728660950555),
+    (0.01667062450794444, -0.27703952688426003, 1.5408270279440412, -4.134354812556947,
+     5.670743550230777, -3.0944924679150705),
+    (-0.008796327443018104, 0.16119674069064063, -1.4393873969387612, 6.428719788271535,
+     -12.329175000210807, 8.035353492613773),
+)  # fmt: skip
+
+
+def _correction_table() -> Floats:
+    """The coefficients of q^i tau^j, tau = 1 - rho, times (i + j)^n: shape (n, i, j)."""
+    out = np.zeros((4, 4, 7))
+    for i, row in enumerate(CORRECTION):
+        in_tau = np.polynomial.Polynomial([0.0, *row])(np.polynomial.Polynomial([1.0, -1.0])).coef
+        for n in range(4):
+            power = np.arange(in_tau.size, dtype=np.float64) + (i + 1)
+            out[n, i, : in_tau.size] = np.asarray(in_tau, dtype=float) * power**n
+    return out
+
+
+CORRECTIONS = _correction_table()
+
+# omega(x) at the middle of cells that are equal in the bits of x + OFFSET, and its slope
+OFFSET = 41.0
+CELL_BITS = 7  # of the mantissa
+CELL_SHIFT = 52 - CELL_BITS
+FIRST_CELL = 1023 << CELL_BITS
+
+
+def _omega_table() -> Floats:
+    cells = np.arange(52 << CELL_BITS, dtype=np.int64) + FIRST_CELL  # x up to 2^52
+    middle = ((cells << CELL_SHIFT) | (1 << (CELL_SHIFT - 1))).view(np.float64)
+    omega = np.real(wrightomega(middle - OFFSET))
+    return np.stack([omega, 1.0 / (1.0 + omega)], axis=1).ravel()
+
+
+OMEGA = _omega_table()
+
+
+@inner(fastmath=FAST, inline="always")
+def _correct(n, q, tau):
+    """(q d/dq)^n of the correction, at constant r."""
+    total = 0.0
+    for i in range(3, -1, -1):
+        row = 0.0
+        for j in range(6, -1, -1):
+            row = row * tau + CORRECTIONS[n, i, j]
+        total = (total + row) * q
+    return total
+
+
+@inner(fastmath=FAST, forceinline=True)
+def _exp(x):
+    """exp(x); not inlined before its own rules of arithmetic hold, see `fastmath.FAST`."""
+    return exp2(x * LOG2_E)
+
+
+@inner(fastmath=FAST, inline="always")
+def _nearest(n):
+    """The photon number that terms of the sum are relative to, and by how much n exceeds it."""
+    k = max(np.rint(n), 0.0)
+    return k, n - k
+
+
+@inner(fastmath=FAST, inline="always")
+def _steps(excess, inverse):
+    """Ratios of the Gaussians at one photon more, and at one less, to that at the nearest."""
+    up = _exp(min(excess - 0.5, 0.0) * inverse)
+    return up, _exp(min(-excess - 0.5, 0.0) * inverse), _exp(-inverse)
+
+
+@inner(fastmath=FAST, inline="always")
+def _sum_density(n, mu, variance):
+    """log p of the sum, less what depends on n alone."""
+    mu = max(mu, LEAST)
+    k, excess = _nearest(n)
+    up, down, q = _steps(excess, 1.0 / variance)
+    # 1 + a / (k + 1) (1 + a q / (k + 2) (1 + ...)) over a common denominator
+    a = max(up * mu, NEGLIGIBLE)
+    above, common, power, step, fixed = 1.0, 1.0, 1.0, 1.0, 1.0
+    for j in range(1, REACH + 1):
+        power *= a
+        above = above * (k + j) + power * fixed
+        common *= k + j
+        step *= q
+        fixed = max(fixed * step, NEGLIGIBLE)  # q^(j (j + 1) / 2): the same for every pixel
+    # mu^REACH times down k / mu (1 + down q (k - 1) / mu (1 + ...))
+    a = max(down, NEGLIGIBLE)
+    below, power, step, fixed = 0.0, 1.0, 1.0, 1.0
+    for j in range(1, REACH + 1):
+        power *= a * (k - j + 1.0)
+        below = below * mu + power * fixed
+        step *= q
+        fixed = max(fixed * step, NEGLIGIBLE)
+    power = mu * mu
+    power *= power
+    power *= power
+    return (k - REACH) * log(mu) - mu + log(power * above + common * below)
+
+
+@inner(fastmath=FAST, inline="always", error_model="numpy")
+def _derivatives(mu, first, second, third):
+    """Score, weight and C from the cumulants of the photon number given n."""
+    inverse = 1.0 / mu
+    weight = max(first - second, 0.0) * inverse * inverse
+    curve = 0.5 * (third - 3.0 * second + 2.0 * first) * inverse * inverse * inverse
+    return first * inverse - 1.0, weight, curve
+
+
+@inner(fastmath=FAST, inline="always", error_model="numpy")
+def _sum_derivatives(n, mu, variance):
+    """Score, weight and C of the sum."""
+    mu = max(mu, LEAST)
+    k, excess = _nearest(n)
+    up, down, q = _steps(excess, 1.0 / variance)
+    total, photons, first, second, third = 1.0, k, 0.0, 0.0, 0.0
+    a, power, step, fixed = max(up * mu, NEGLIGIBLE), 1.0, 1.0, 1.0
+    for j in range(1, REACH + 1):
+        power *= a / (k + j)
+        term = power * fixed
+        step *= q
+        fixed = max(fixed * step, NEGLIGIBLE)
+        total += term
+        photons += (k + j) * term
+        first += j * term
+        second += j * j * term
+        third += j * j * j * term
+    a, power, step, fixed = max(down, NEGLIGIBLE) / mu, 1.0, 1.0, 1.0
+    for j in range(1, REACH + 1):
+        power *= a * (k - j + 1.0)
+        term = power * fixed
+        step *= q
+        fixed = max(fixed * step, NEGLIGIBLE)
+        total += term
+        photons += (k - j) * term
+        first -= j * term
+        second += j * j * term
+        third -= j * j * j * term
+    inverse = 1.0 / total
+    m1, m2, m3 = first * inverse, second * inverse, third * inverse
+    third = m3 - m1 * (3.0 * m2 - 2.0 * m1 * m1)
+    return _derivatives(mu, photons * inverse, m2 - m1 * m1, third)
+
+
+@inner(fastmath=FAST, inline="always")
+def _rough_log(x):
+    """log(x) of a positive normal number to 1e-4, without a division; see `fastmath.log`."""
+    bits = as_bits(x)
+    k = (bits - 4604544271217802189) >> 52
+    m = as_float(bits - (k << 52)) - 1.0
+    p = m * (0.99935223 + m * (-0.50246549 + m * (0.35871218 - m * 0.22848254)))
+    return k * math.log(2.0) + p
+
+
+@inner(fastmath=FAST, inline="always", error_model="numpy")
+def _tilt(n, mu, variance):
+    """s and y to 1e-8, and 1 / (y + r^2)."""
+    inverse = 1.0 / variance
+    shifted = max(n * inverse + _rough_log(mu * inverse) + OFFSET, 1.0)
+    bits = as_bits(shifted)
+    cell = np.uint64((bits >> CELL_SHIFT) - FIRST_CELL) * np.uint64(2)
+    middle = as_float(((bits >> CELL_SHIFT) << CELL_SHIFT) | (1 << (CELL_SHIFT - 1)))
+    omega, slope = OMEGA[cell], OMEGA[cell + np.uint64(1)]
+    s = n * inverse - omega * (1.0 + (shifted - middle) * slope)
+    y = mu * _exp(s)
+    q = 1.0 / (y + variance)
+    newton = (y + variance * s - n) * q
+    change = newton * (1.0 + 0.5 * newton * y * q)
+    less = y * change * (1.0 - change * (0.5 - change * (1.0 / 6.0)))
+    relative = less * q  # of y + r^2
+    return s - change, y - less, q * (1.0 + relative * (1.0 + relative * (1.0 + relative)))
+
+
+@inner(fastmath=FAST, inline="always", error_model="numpy")
+def _tilted_density(n, mu, variance):
+    """log p of the saddlepoint expansion, less -1/2 log(2 pi)."""
+    mu = max(mu, TINY)
+    s, y, q = _tilt(n, mu, variance)
+    tilted = y - mu + s * (0.5 * variance * s - n)
+    return tilted + 0.5 * log(q) + _correct(0, q, variance * q)
+
+
+@inner(fastmath=FAST, inline="always", error_model="numpy")
+def _tilted_derivatives(n, mu, variance):
+    """Score, weight and C of the saddlepoint expansion.
+
+    The cumulants of the photon number given n are derivatives by log mu. With L that derivative
+    and M = q d/dq, L y = y tau and L = -rho tau M for functions of q.
+    """
+    mu = max(mu, TINY)
+    s, y, q = _tilt(n, mu, variance)
+    y = mu * _exp(s - (y + variance * s - n) * q)  # to rounding
+    q = 1.0 / (y + variance)
+    tau, rho = variance * q, y * q
+    m1, m2, m3 = 0.5 + _correct(1, q, tau), _correct(2, q, tau), _correct(3, q, tau)
+    by = -rho * tau
+    by1 = -rho * tau * tau * (tau - rho)
+    by2 = -rho * tau * tau * tau * (1.0 - rho * (7.0 - 8.0 * rho))
+    second = y * tau + by1 * m1 + by * by * m2
+    third = y * tau * tau * tau + by2 * m1 + 3.0 * by * by1 * m2 + by * by * by * m3
+    return _derivatives(mu, y + by * m1, second, third)
+
+
+def _choice(few: Any, many: Any, mixed: Any) -> Any:
+    """A function of (kind, n, mu, variance) that the length of the tuple `kind` chooses."""
+
+    def function(kind: Any, n: Any, mu: Any, variance: Any) -> Any:
+        raise NotImplementedError("for compiled code")
+
+    @overload(function, inline="always", strict=False)
+    def choose(kind: Any, n: Any, mu: Any, variance: Any) -> Any:
+        return (few, many, mixed)[len(kind)]
+
+    return function
+
+
+def _density_few(kind, n, mu, variance):
+    return _sum_density(n, mu, variance)
+
+
+def _density_many(kind, n, mu, variance):
+    return _tilted_density(n, mu, variance)
+
+
+def _density_mixed(kind, n, mu, variance):
+    few = _sum_density(n, mu, min(variance, WIDE))
+    many = _tilted_density(n, mu, max(variance, WIDE))
+    return few if variance < WIDE else many
+
+
+def _derivatives_few(kind, n, mu, variance):
+    return _sum_derivatives(n, mu, variance)
+
+
+def _derivatives_many(kind, n, mu, variance):
+    return _tilted_derivatives(n, mu, variance)
+
+
+def _derivatives_mixed(kind, n, mu, variance):
+    few = _sum_derivatives(n, mu, min(variance, WIDE))
+    many = _tilted_derivatives(n, mu, max(variance, WIDE))
+    return few if variance < WIDE else many
+
+
+density_of = _choice(_density_few, _density_many, _density_mixed)
+derivatives_of = _choice(_derivatives_few, _derivatives_many, _derivatives_mixed)
+
+
+def kind_of(variance: float | Floats) -> tuple[int, ...]:
+    """Which formulas the pixels need: the sum (), the expansion (0,) or both (0, 0)."""
+    wide = np.asarray(variance) >= WIDE
+    return () if not wide.any() else (0,) if wide.all() else (0, 0)
+
+
+def left_out(counts: Floats, variance: float | Floats) -> Floats:
+    """The part of log p that depends on counts and read noise alone."""
+    k = np.maximum(np.rint(counts), 0.0)
+    few = gammaln(k + REACH + 1.0) + 0.5 * ((counts - k) ** 2 / variance + np.log(variance))
+    return -0.5 * math.log(2.0 * math.pi) - np.where(np.asarray(variance) < WIDE, few, 0.0)
