@@ -257,17 +257,17 @@ def _row(values: dict[str, Any], parameter: Parameter, levels: Floats) -> dict[s
 
 
 def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
+    """A row for each check, then the paper's two numbers, of which nothing is expected."""
     d = diagnostics
+    rows = [
+        _Statistic(
+            check["name"], *(_number(check[key]) for key in ("value", "expected", "sd")),
+            _z(check["z"]), check["meaning"],
+        )
+        for check in d.checks
+    ]  # fmt: skip
     return [
-        _statistic(
-            "Pearson", d.pearson, d.pearson_expected, d.pearson_sd,
-            "sum of (counts − model)² / variance over the pixels used",
-        ),
-        _statistic(
-            "Deviance", d.deviance, d.deviance_expected, d.deviance_sd,
-            "twice the log-likelihood that a perfect model would gain; expectation exact for any "
-            "mean count",
-        ),
+        *rows,
         _Statistic(
             "χ² of Sun & "
             "Zhou", _general(d.chi2_paper), "1" if math.isfinite(d.chi2_paper) else "", "", "",
@@ -281,15 +281,11 @@ def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
     ]  # fmt: skip
 
 
-def _statistic(name: str, value: float, expected: float, sd: float, meaning: str) -> _Statistic:
-    return _Statistic(
-        name,
-        f"{value:.1f}",
-        f"{expected:.1f}",
-        f"{sd:.1f}",
-        _z((value - expected) / sd if sd > 0 else math.nan),
-        meaning,
-    )
+def _number(value: float) -> str:
+    """Numbers of all sizes, with a digit that matters; empty where there is none."""
+    if not math.isfinite(value):
+        return ""
+    return _minus(f"{value:.1f}" if abs(value) >= 100.0 else f"{value:.3g}")
 
 
 def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]:

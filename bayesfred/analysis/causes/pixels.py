@@ -96,7 +96,7 @@ def _level(context: Context) -> float:
     noise = context.posterior.noise
     if not isinstance(noise, PoissonNoise):
         return 1.0
-    mu = float(np.mean(context.expected[context.quiet])) + noise.shift
+    mu = float(np.mean(noise.counts_variance(context.expected, context.level)[context.quiet]))
     return max((mu + float(np.mean(context.residual[context.quiet]))) / max(mu, 1e-9), 0.1)
 
 
@@ -160,8 +160,9 @@ def _noise(context: Context, ratio: float) -> Finding:
     """
     if not isinstance(context.posterior.noise, PoissonNoise):
         return _finding_of_noise(context, "over-dispersion", ratio, np.ones(1))
-    shift = context.posterior.noise.shift
-    mu, b = context.expected + shift, max(context.level + shift, 1e-9)
+    noise, mean, level = context.posterior.noise, context.expected, context.level
+    mu = noise.counts_variance(mean, level)
+    b = np.maximum(noise.counts_variance(np.full_like(mean, level), level), 1e-9)
     lit = context.used & (context.distance <= 1.5 * context.light.width) & (mu > 1.5 * b)
     matched = context.light.matched[context.owner] & lit
     power = context.power[context.owner]
