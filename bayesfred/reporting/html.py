@@ -261,8 +261,8 @@ def _statistics(diagnostics: Diagnostics) -> list[_Statistic]:
     d = diagnostics
     rows = [
         _Statistic(
-            check["name"], *(_number(check[key]) for key in ("value", "expected", "sd")),
-            _z(check["z"]), check["meaning"],
+            check["name"], _number(check["value"]), _number(check["expected"]),
+            _number(check["sd"]), _z(check["z"]), check["meaning"],
         )
         for check in d.checks
     ]  # fmt: skip
