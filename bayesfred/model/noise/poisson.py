@@ -168,7 +168,7 @@ def blurred_cdf(x: Floats, mu: Floats, read_noise: float) -> Floats:
     Examples
     --------
     >>> blurred_cdf(np.array([5.0, 500.0]), np.array([5.0, 500.0]), 2.0).round(4)
-    array([0.5441, 0.5059])
+    array([0.5124, 0.5029])
     """
     variance = mu + read_noise**2
     smooth = (variance >= SMOOTH_FROM) & (read_noise >= BLURRED_FROM)
