@@ -29,6 +29,7 @@ from bayesfred.model.noise.poisson import blurred_cdf
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
+from bayesfred.reporting.goodness import described_residuals, residual_panels
 
 Floats = NDArray[np.float64]
 
@@ -287,3 +288,29 @@ def test_predicted_frames_are_like_the_observed_one_or_not() -> None:
     checks = predictive_checks(Posterior(wrong, posterior.counts), draws)
     # the most that 30 draws can tell
     assert [check.z for check in checks] == pytest.approx([stats.norm.isf(0.5 / 31)] * 4)
+
+
+# --- frames that tell little ----------------------------------------------------------------------
+
+SPARSE = {
+    "one source": (Detector((40, 40)), [0.0], None),
+    "a source outside the frame": (Detector((40, 40)), [0.0, 500.0], None),
+    "one pixel": (Detector((1, 1), pixel="box"), [0.0], None),
+    "a row of pixels": (Detector((1, 60), pixel="box"), [0.0], None),
+    "no counts": (Detector((40, 40)), [0.0], 0.0),
+}
+
+
+@pytest.mark.parametrize("case", SPARSE)
+def test_frames_that_tell_little_are_judged_and_shown(case: str) -> None:
+    detector, x, counts = SPARSE[case]
+    sources = SourceCatalog(x, np.zeros(len(x)), np.full(len(x), 1e3))
+    model = ForwardModel(detector, sources, GaussianPSF(2.0), FIELD)
+    params = np.array([0.0, 0.0, 0.0, 3.0])
+    posterior = Posterior(model, np.full(detector.shape, 3.0 if counts is None else counts))
+    residuals = judge_residuals(posterior, params, np.zeros((4, 4)))
+    assert len(residuals.sources) == len(x)
+    phases = [check for check in residuals.checks if check.name.startswith("pixel phase")]
+    assert all(check.meaning.startswith("not tested") for check in phases)
+    assert len(residual_panels(residuals, detector.shape).axes) == 4
+    assert described_residuals(residuals)

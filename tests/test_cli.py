@@ -809,7 +809,9 @@ def check_refusal(refusal: Refusal, folder: Path) -> Output:
 
 def names_a_file(output: Output) -> bool:
     """Whether the line begins with the file that has to be corrected."""
-    return re.match(r"bayesfred: [^:]*\.(toml|fits|csv|h5|html|png): ", output.stderr) is not None
+    return (
+        re.match(r"bayesfred: [^:]*\.(toml|fits|csv|h5|html|png|ecsv): ", output.stderr) is not None
+    )
 
 
 @pytest.mark.parametrize("refusal", by_name(REFUSALS))

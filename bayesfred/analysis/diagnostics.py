@@ -218,7 +218,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     target_ess : float, optional
         Effective draws demanded of every parameter.
     predictive : int, optional
-        Number of draws, 50 say, at which a frame is simulated for posterior predictive checks.
+        Number of draws, 50 say, at which a frame is simulated for posterior predictive checks;
+        each takes as long as all other checks.
 
     Returns
     -------

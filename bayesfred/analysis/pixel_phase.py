@@ -49,7 +49,7 @@ class PixelPhase(NamedTuple):
 def harmonics(phase: Floats) -> Floats:
     """1, and sin and cos of 2 pi phase and of 4 pi phase, shape (n, 5)."""
     angles = 2.0 * np.pi * np.outer(phase, np.arange(1, HARMONICS + 1))
-    waves = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(len(phase), -1)
+    waves = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(len(phase), 2 * HARMONICS)
     return np.column_stack([np.ones(len(phase)), waves])
 
 

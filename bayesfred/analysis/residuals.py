@@ -196,7 +196,7 @@ def _whiteness(posterior: Posterior, fits: SourceFits, level: float, modes: Floa
             checks.append(
                 Check(
                     label, product / pairs, -lost / pairs, pairs**-0.5,
-                    (product + lost) / math.sqrt(pairs),
+                    float((product + lost) / math.sqrt(pairs)),
                     f"mean product of residuals {lag} pixel{'s' * (lag > 1)} apart",
                 )
             )  # fmt: skip

@@ -249,7 +249,7 @@ def blurred_cdf(x: Floats, mu: Floats, read_noise: float | Floats) -> Floats:
     Examples
     --------
     >>> blurred_cdf(np.array([5.0, 500.0]), np.array([5.0, 500.0]), 2.0).round(4)
-    array([0.5441, 0.5059])
+    array([0.5124, 0.5029])
     """
     variance, r = mu + read_noise**2, np.broadcast_to(read_noise, np.shape(x))
     smooth = (variance >= SMOOTH_FROM) & (r >= BLURRED_FROM)
