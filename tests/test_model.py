@@ -172,7 +172,7 @@ def test_score_is_the_slope_of_the_log_likelihood(noise: Noise) -> None:
     n, background = np.array([-1.0, 0.0, 1.0, 12.0, 700.0])[:, None], 0.04
     n = np.maximum(n, 0.0) if noise == PoissonNoise() else n
     blur = getattr(noise, "read_noise", 0.0) ** 2
-    h = 1e-3 * (MEANS + blur)  # the five-point rule errs by h^4 / 30 of the fifth derivative
+    h = 1e-3 * MEANS  # the five-point rule errs by h^4 / 30 of the fifth derivative
     ahead = [noise.log_likelihood(n, MEANS + k * h, background) for k in (-2, -1, 1, 2)]
     slope = (ahead[0] - 8 * ahead[1] + 8 * ahead[2] - ahead[3]) / (12 * h)
     scale = np.abs(n) / (MEANS + blur) + 1.0

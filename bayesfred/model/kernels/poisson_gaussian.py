@@ -96,7 +96,7 @@ def _omega_table() -> Floats:
 OMEGA = _omega_table()
 
 
-@inner(fastmath=FAST, inline="always")
+@inner(fastmath=FAST, forceinline=True)
 def _correct(n, q, tau):
     """(q d/dq)^n of the correction, at constant r."""
     total = 0.0
@@ -114,21 +114,21 @@ def _exp(x):
     return exp2(x * LOG2_E)
 
 
-@inner(fastmath=FAST, inline="always")
+@inner(fastmath=FAST, forceinline=True)
 def _nearest(n):
     """The photon number that terms of the sum are relative to, and by how much n exceeds it."""
     k = max(np.rint(n), 0.0)
     return k, n - k
 
 
-@inner(fastmath=FAST, inline="always")
+@inner(fastmath=FAST, forceinline=True)
 def _steps(excess, inverse):
     """Ratios of the Gaussians at one photon more, and at one less, to that at the nearest."""
     up = _exp(min(excess - 0.5, 0.0) * inverse)
     return up, _exp(min(-excess - 0.5, 0.0) * inverse), _exp(-inverse)
 
 
-@inner(fastmath=FAST, inline="always")
+@inner(fastmath=FAST, forceinline=True)
 def _sum_density(n, mu, variance):
     """log p of the sum, less what depends on n alone."""
     mu = max(mu, LEAST)
@@ -157,7 +157,7 @@ def _sum_density(n, mu, variance):
     return (k - REACH) * log(mu) - mu + log(power * above + common * below)
 
 
-@inner(fastmath=FAST, inline="always", error_model="numpy")
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _derivatives(mu, first, second, third):
     """Score, weight and C from the cumulants of the photon number given n."""
     inverse = 1.0 / mu
@@ -166,7 +166,7 @@ def _derivatives(mu, first, second, third):
     return first * inverse - 1.0, weight, curve
 
 
-@inner(fastmath=FAST, inline="always", error_model="numpy")
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _sum_derivatives(n, mu, variance):
     """Score, weight and C of the sum."""
     mu = max(mu, LEAST)
@@ -201,7 +201,7 @@ def _sum_derivatives(n, mu, variance):
     return _derivatives(mu, photons * inverse, m2 - m1 * m1, third)
 
 
-@inner(fastmath=FAST, inline="always")
+@inner(fastmath=FAST, forceinline=True)
 def _rough_log(x):
     """log(x) of a positive normal number to 1e-4, without a division; see `fastmath.log`."""
     bits = as_bits(x)
@@ -211,7 +211,7 @@ def _rough_log(x):
     return k * math.log(2.0) + p
 
 
-@inner(fastmath=FAST, inline="always", error_model="numpy")
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilt(n, mu, variance):
     """s and y to 1e-8, and 1 / (y + r^2)."""
     inverse = 1.0 / variance
@@ -230,7 +230,7 @@ def _tilt(n, mu, variance):
     return s - change, y - less, q * (1.0 + relative * (1.0 + relative * (1.0 + relative)))
 
 
-@inner(fastmath=FAST, inline="always", error_model="numpy")
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilted_density(n, mu, variance):
     """log p of the saddlepoint expansion, less -1/2 log(2 pi)."""
     mu = max(mu, TINY)
@@ -239,7 +239,7 @@ def _tilted_density(n, mu, variance):
     return tilted + 0.5 * log(q) + _correct(0, q, variance * q)
 
 
-@inner(fastmath=FAST, inline="always", error_model="numpy")
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilted_derivatives(n, mu, variance):
     """Score, weight and C of the saddlepoint expansion.
 
