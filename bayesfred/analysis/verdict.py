@@ -74,12 +74,11 @@ def judge_fit(posterior: Any, params: Floats, fit: Mapping[str, float]) -> FitVe
         if not fits:
             causes = find_causes(posterior, params)
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
-    sums = f"{sums} expectation{matched}"
     if fits:
-        sentence = f"The model fits the counts: {sums}."
+        sentence = f"The model fits the counts: {sums} expectation{matched}."
     else:
-        sentence = f"The model does not fit the counts: {sums} (at most {CONSISTENT:.0f} are "
-        sentence += f"expected). {_why(causes)}"
+        bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
+        sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
     return FitVerdict(fits, causes, sentence, _omitted(posterior, fit, fits))
 
 

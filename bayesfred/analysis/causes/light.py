@@ -136,11 +136,13 @@ def _shape(context: Context, explained: float, profile: Floats) -> Finding | Non
     side = "more" if profile[worst] > 0.0 else "less"
     also = _turns(profile)
     mode = context.posterior.nuisances.psf_sigma
+    impulse = context.posterior.model.detector.pixel == "impulse"
+    box = ', or pixel = "box" if it is narrow' if impulse else ""
     cause = Cause(
         "PSF", 0.0,
         f"around the sources the counts have {side} light than the PSF, by "
         f"{abs(profile[worst]) / peak:.2%} of its peak at {ring:.1f} pixels{also}",
-        'fit another PSF: kind = "moffat" or "sampled", pixel = "box" for a narrow one' if mode
+        f'fit another PSF: kind = "moffat" or "sampled"{box}' if mode
         else "set nuisances.psf_sigma = true, or fit another PSF",
     )  # fmt: skip
     return Finding(cause, explained, "light", RICHER)
