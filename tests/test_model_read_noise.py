@@ -240,9 +240,6 @@ def false_alarms(r: float, background: float, frames: int, law: str = "own") -> 
     """In how many frames of sky whose level is fitted the deviance is 3 sd too high."""
     rng, noise, size = np.random.default_rng(704), PoissonNoise(r), 4000
     mean = np.full(size, background)
-    expected, variance, slope = (each[0] for each in noise.deviance_moments(mean, background))
-    known = noise.fisher_weight(mean, background)[0]
-    left = size * (variance - slope**2 / known)
     alarms = 0
     for _ in range(frames):
         n = noise.draw(np.zeros(size), mean, rng)
@@ -256,12 +253,16 @@ def false_alarms(r: float, background: float, frames: int, law: str = "own") -> 
             moments = 1.0 + 1.0 / (6.0 * (background + r * r))
             alarms += int((deviance.sum() - size * moments) / math.sqrt(2.0 * size) > 3.0)
             continue
-        level = background  # one step of scoring
-        for _ in range(3):
+        level = background
+        for _ in range(8):  # scoring
             at = np.full(size, level)
+            known = noise.fisher_weight(at[:1], level)[0]
             level = max(level + noise.score(n, at, level).sum() / (size * known), 1e-6)
-        deviance = noise.deviance(n, np.full(size, level), level).sum()
-        alarms += int((deviance - size * expected + 1.0) / math.sqrt(left) > 3.0)
+        at = np.full(size, level)
+        expected, variance, slope = (each[0] for each in noise.deviance_moments(at[:1], level))
+        left = variance - slope**2 / noise.fisher_weight(at[:1], level)[0]
+        excess = noise.deviance(n, at, level).sum() - size * expected + 1.0
+        alarms += int(excess / math.sqrt(size * left) > 3.0)
     return alarms
 
 

@@ -145,7 +145,7 @@ def _refuse_shifted_poisson(file: h5py.File) -> None:
     Its log-probabilities are those of another model than the one that would be read.
     """
     noise = file["posterior/noise"].attrs
-    shifted = noise["kind"] == b"noise.poisson" and noise["read_noise"] > 0.0
+    shifted = noise["kind"] == b"noise.poisson" and noise.get("read_noise", 0.0) > 0.0
     if shifted and file.attrs["schema"] < SCHEMA:
         raise InputError(
             f"noise: got read noise {noise['read_noise']:g} as the shifted Poisson distribution "
