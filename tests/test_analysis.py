@@ -507,8 +507,8 @@ def test_a_psf_that_is_too_wide_is_sampled_well_and_does_not_fit() -> None:
     assert verdict.sampled_well and not verdict.fits_data and not verdict.trustworthy
     assert re.match(
         r"not trustworthy: The model does not fit the counts: deviance \d+\.\d standard deviations "
-        r"above and Pearson's statistic \d+\.\d standard deviations above expectation \(at most 5 if "
-        r"it did\), 9 of 9 sources matched\. Probable cause: PSF \(\d+% of the misfit\): "
+        r"above and Pearson's statistic \d+\.\d standard deviations above expectation \(at most 5 "
+        r"if it did\), 9 of 9 sources matched\. Probable cause: PSF \(\d+% of the misfit\): "
         r".* Remedy: .*\. Sampled well: R-hat .*\. The error bars leave out .*\.$",
         verdict.message,
     )

@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
@@ -17,6 +18,7 @@ from matplotlib.quiver import Quiver
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+import bayesfred as bf
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.field import displacement_field
 from bayesfred.errors import InputError
@@ -217,12 +219,10 @@ def test_residual_of_a_frame_without_pixels_is_described() -> None:
 def test_page_lists_causes(tmp_path: Path) -> None:
     chain, _ = run()
     found = diagnose(chain)
-    names = ("trustworthy", "columns", *found.__dataclass_fields__)
-    cause = SimpleNamespace(sentence="The PSF is too <wide>.", remedy="Fit its width.")
-    causes = SimpleNamespace(**{name: getattr(found, name) for name in names}, causes=(cause,))
-    text, page = report(tmp_path, chain=chain, diagnostics=causes)
-    assert "The PSF is too <wide>. Fit its width." in page.text
-    assert text.index('class="verdict') < text.index("The PSF is too") < text.index("<table")
+    cause = bf.Cause("PSF", 0.6, "it is too <wide>", "fit its width")
+    text, page = report(tmp_path, chain=chain, diagnostics=replace(found, causes=(cause,)))
+    assert "PSF (60% of the misfit): it is too <wide>. Remedy: fit its width." in page.text
+    assert text.index('class="verdict') < text.index("it is too") < text.index("<table")
 
 
 def test_page_says_what_it_must(tmp_path: Path) -> None:

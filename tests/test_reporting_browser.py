@@ -6,17 +6,18 @@ fail on a page that was spoilt.
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from test_reporting import BACKGROUND, TRUTH, described, report, run
 
+import bayesfred as bf
 from bayesfred.analysis.comparison import Comparison, Score
-from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
@@ -40,12 +41,9 @@ LARGEST = 2_000_000  # bytes
 SETTINGS = "\n".join(f'[section_{k}]\nkey = "{"a long value " * 12}"' for k in range(9))
 
 
-def found_with_causes(found: Any) -> Any:
-    values = {name: getattr(found, name) for name in ("columns", *found.__dataclass_fields__)}
-    cause = SimpleNamespace(
-        sentence="The images are wider than the PSF.", remedy="Fit it: psf_sigma = true."
-    )
-    return SimpleNamespace(**{**values, "trustworthy": False}, causes=(cause, cause))
+def found_with_causes(found: Diagnostics) -> Diagnostics:
+    cause = bf.Cause("PSF", 0.4, "the images are wider than the PSF", "set psf_sigma = true")
+    return replace(found, fits_data=False, causes=(cause, cause))
 
 
 @cache
