@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 import bayesfred as bf
-from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.field import displacement_field
+from bayesfred.analysis.residuals import judge_residuals
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
@@ -32,7 +33,7 @@ from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.field import field_plot
-from bayesfred.reporting.figures import described_residual, page_figures
+from bayesfred.reporting.figures import PageFigure, described_residual, page_figures
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
 from bayesfred.reporting.html import write_report
 from bayesfred.reporting.labels import axis_label
@@ -159,6 +160,19 @@ def fitted(posterior: Any, params: Floats) -> FittedFrame:
     return FittedFrame.at(posterior, params)
 
 
+def figures_of(
+    chain: Any, posterior: Any, frame: FittedFrame | None = None, **options: Any
+) -> tuple[Diagnostics, list[PageFigure]]:
+    """A verdict with residuals, and all figures of a page."""
+    params, width = chain.estimate.params, chain.draws().std(axis=0)
+    real = Posterior(posterior.model, posterior.counts)
+    residuals = judge_residuals(real, params[:5], np.diag(width[:5] ** 2))
+    diagnostics = replace(diagnose(chain), residuals=residuals)
+    frame = frame or fitted(posterior, params)
+    field, _ = field_of(Detector((61, 81)), 0.02)
+    return diagnostics, page_figures(frame, chain, diagnostics, field, **options)
+
+
 def report(tmp_path: Path, *, truth: Floats | None = None, **changes: Any) -> tuple[str, Page]:
     """A page, without figures unless they are given."""
     chain = changes.get("chain") or run()[0]
@@ -176,13 +190,12 @@ def report(tmp_path: Path, *, truth: Floats | None = None, **changes: Any) -> tu
 def test_page_stands_alone_and_is_well_formed(tmp_path: Path) -> None:
     chain, posterior = run()
     truth = np.append(TRUTH, BACKGROUND)
-    frame = fitted(posterior, chain.estimate.params)
-    figures = page_figures(frame, chain, diagnose(chain), shown=(0, 1, 3), truth=truth)
+    _, figures = figures_of(chain, posterior, shown=(0, 1, 3), truth=truth)
     text, page = report(tmp_path, truth=truth, chain=chain, figures=figures)
     assert not page.open
     assert "script" not in page.tags and "link" not in page.tags
     images = [link for link in page.links if link.startswith("data:image/png;base64,")]
-    assert len(images) == 5 and all(link[0] == "#" for link in set(page.links) - set(images))
+    assert len(images) == 7 and all(link[0] == "#" for link in set(page.links) - set(images))
     assert all(f'id="{link[1:]}"' in text for link in page.links if link[0] == "#")
     assert "http:" not in text and "https:" not in text
     assert "url(" not in re.sub(r"data:image/png;base64,[^\"]*", "", text)
@@ -197,10 +210,12 @@ def test_alternative_texts_say_what_is_seen(tmp_path: Path) -> None:
     chain, posterior = run()
     chain.chain[..., 1] = chain.chain[..., 0] * 2.0  # a correlation of 1
     frame = fitted(posterior, chain.estimate.params)
-    figures = page_figures(frame, chain, diagnose(chain), shown=(0, 1, 3))
+    _, figures = figures_of(chain, posterior, shown=(0, 1, 3))
     _, page = report(tmp_path, chain=chain, figures=figures)
     residual = frame.residual()[frame.mask]
-    seen, stars, pairs, others, trace = page.alternatives
+    field, seen, stars, residuals, pairs, others, trace = page.alternatives
+    assert field.startswith("Displacement: rms ")
+    assert "Of 9 sources 0 have a chi-square more than 5" in residuals
     assert f"{frame.counts[frame.mask].max():.0f} counts" in seen
     assert f"{residual.max():.1f} standard deviations" in seen
     assert f"{100 * np.mean(np.abs(residual) > 3):.2f} % of {residual.size} pixels" in seen
@@ -395,7 +410,7 @@ def test_a_term_at_the_corner_is_its_largest_displacement_there() -> None:
         chain = SimpleNamespace(
             chain=draws, burn_in=0, parameter_names=posterior.parameter_names,
             draws=lambda draws=draws: draws.reshape(-1, draws.shape[-1]),
-            posterior=lambda posterior=posterior: posterior,
+            posterior=lambda posterior=posterior: posterior, method="mcmc",
             estimate=SimpleNamespace(params=np.ones(posterior.n_parameters)),
         )  # fmt: skip
         table = summary(chain)
@@ -516,9 +531,8 @@ def test_any_field_is_shown(shape: tuple[int, int], scale: float) -> None:
 def test_page_begins_with_the_displacement(tmp_path: Path) -> None:
     field, _ = field_of(Detector((61, 81)), 0.02)
     chain, posterior = run()
-    posterior.likelihood = Posterior(posterior.model, posterior.counts).likelihood
-    figures = page_figures(fitted(posterior, chain.estimate.params), chain, field=field)
-    assert figures[0].heading == "Displacement" and len(figures) == 5
+    _, figures = figures_of(chain, posterior, shown=range(5))
+    assert figures[0].heading == "Displacement"
     _, page = report(tmp_path, chain=chain, figures=figures, result=field.message)
     verdict, rest = page.text.split("Parameters")[0], page.text.split("Parameters")[1]
     assert field.message in verdict and field.message not in rest

@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_reporting import BACKGROUND, TRUTH, described, report, run
+from test_reporting import BACKGROUND, TRUTH, described, figures_of, report, run
 
 import bayesfred as bf
 from bayesfred.analysis.comparison import Comparison, Score
-from bayesfred.analysis.diagnostics import Diagnostics, diagnose
+from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
-from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.sampling.record import RunRecord
 
@@ -60,8 +59,9 @@ def contents(d: int) -> tuple[Any, Any, Any, Any]:
         noise = np.random.default_rng(1).poisson(50.0, (1200, 600)).astype(float)
         level = np.full(noise.shape, 50.0)
         fitted = FittedFrame(noise, level, level**0.5, noise >= 0.0)
-    diagnostics = diagnose(chain)
-    figures = page_figures(fitted, chain, diagnostics, shown=range(min(d, 12)), truth=truth)
+    diagnostics, figures = figures_of(
+        chain, posterior, fitted, shown=range(min(d, 12)), truth=truth
+    )
     return chain, diagnostics, truth, figures
 
 
