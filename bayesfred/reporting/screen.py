@@ -133,6 +133,7 @@ def study_table(result: NoiseStudy | PosteriorCalibration, width: int) -> Table:
         [
             _Column(names.get(key, key), [cell(key, k) for k in range(len(rows[key]))], gives_way)
             for key, gives_way in (dict.fromkeys(heads, 0) | shown).items()
+            if key in rows  # none where every frame failed
         ],
         width,
     )
