@@ -74,9 +74,9 @@ def table_lines(text: str) -> list[str]:
 @pytest.mark.parametrize(
     ("columns", "present", "absent"),
     [
-        (60, ["posterior mean +- sd", "ESS"], ["MAP", "prior sens."]),
-        (80, ["posterior mean +- sd", "R-hat", "ESS", "prior sens."], []),
-        (200, ["posterior mean +- sd", "MAP", "R-hat", "ESS", "prior sens."], []),
+        (60, ["posterior mean +- sd", "px at corner"], ["MAP", "prior"]),
+        (80, ["posterior mean +- sd", "px at corner", "R-hat", "ESS"], ["MAP"]),
+        (200, ["posterior mean +- sd", "px at corner", "MAP", "R-hat", "ESS", "prior"], []),
     ],
 )
 def test_a_table_fits_the_terminal(
@@ -145,6 +145,8 @@ def parameters(**changed: Any) -> Any:
         "mean": np.array([-2.1e-6, 5.1]),
         "sd": np.array([1e-7, 0.1]),
         "z": np.array([1.0, np.nan]),
+        "corner": np.array([-0.031, np.nan]),
+        "corner_sd": np.array([0.002, np.nan]),
         "rhat": np.array([1.001, 1.002]),
         "ess_bulk": np.array([1200.0, 1300.0]),
         "ess_tail": np.array([1100.0, 1400.0]),
@@ -165,16 +167,16 @@ def test_what_says_least_gives_way_first(width: int) -> None:
     summary = parameters()
     table = parameter_table(summary, width)
     heads = [str(column.header) for column in table.columns]
-    order = ["MAP", "prior sens.", "R-hat", "truth", "ESS", "z"]
+    order = ["prior", "MAP", "R-hat", "truth", "ESS", "z", "px at corner"]
     left_out = [head for head in order if head not in heads]
     assert left_out == order[: len(left_out)]
-    assert heads[0] == "coefficient" and "posterior mean +- sd" in heads
+    assert heads[0] == "parameter" and "posterior mean +- sd" in heads
     lines = rendered(table, width)
     assert max(map(len, lines)) <= width
     if width >= 80:
         assert any("a_parameter_whose_name_has_40_characters" in line for line in lines)
         assert any("-2.10 +- 0.10 e-06" in line for line in lines)
-    assert (left_out == []) == (width >= 144)
+    assert (left_out == []) == (width == 200)
     assert not any("nan" in line for line in lines)
 
 
@@ -182,7 +184,8 @@ def test_columns_without_numbers_are_left_out() -> None:
     nothing = np.full(2, np.nan)
     summary = parameters(rhat=nothing, ess_bulk=nothing, ess_tail=nothing)
     heads = [str(column.header) for column in parameter_table(summary, 200).columns]
-    assert heads == ["coefficient", "truth", "MAP", "posterior mean +- sd", "z", "prior sens."]
+    expected = ["truth", "MAP", "posterior mean +- sd", "z", "px at corner", "prior"]
+    assert heads == ["parameter", *expected]
 
 
 def test_a_ranking_of_long_paths_fits() -> None:
@@ -212,7 +215,9 @@ def test_json_is_one_object_and_all_else_is_on_standard_error(
     assert {"unit", "MAP", "mean", "sd", "rhat", "ess_bulk", "ess_tail"} <= set(
         found["parameters"][0]
     )
-    assert found["files"] == {"chain": "other.h5", "report": "other.html", "picture": "other.png"}
+    kinds = {"chain": "h5", "report": "html", "picture": "png", "sources": "sources.ecsv"}
+    assert found["files"] == {name: f"other.{kind}" for name, kind in kinds.items()}
+    assert found["causes"] == [] and found["displacement"].startswith("Displacement: rms ")
 
     said = invoke(folder, "fit", "run.toml", "--map-only", "--json")
     found = json.loads(said.stdout, parse_constant=pytest.fail)

@@ -46,8 +46,8 @@ def parameter_table(summary: Any, width: int) -> Table:
     summary : astropy.table.Table
         See `bayesfred.sampling.summary.summary`, with `Diagnostics.columns`.
     width : int
-        Characters in a line. Where they do not suffice, columns are left out: MAP first, then
-        prior sensitivity, R-hat, truth, ESS and z.
+        Characters in a line. Where they do not suffice, columns are left out: prior first, then
+        MAP, R-hat, truth, ESS, z and the displacement at the corner.
 
     Returns
     -------
