@@ -53,7 +53,8 @@ def test_report_verify_and_compare(
     mapped: tuple[Path, Output], finished: tuple[Path, Output], tmp_path: Path
 ) -> None:
     folder = shutil.copytree(mapped[0], tmp_path / "run")
-    (folder / "run.html").unlink()
+    for kind in ("html", "png", "sources.ecsv"):
+        (folder / f"run.{kind}").unlink()
     again = invoke(folder, "report", "run.h5")
     assert again.code == 0 and (folder / "run.html").exists()
     assert again.stdout.splitlines()[-1] == mapped[1].stdout.splitlines()[-1]

@@ -127,7 +127,8 @@ def test_report_replaces_nothing_unasked(finished: Path, tmp_path: Path) -> None
         assert (tmp_path / name).read_text() == "precious"
         (tmp_path / name).unlink()
     assert invoke(tmp_path, "report", "run.h5", "--out", "other.html")[0] == 3
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["other.html", "other.png", "run.h5"]
+    made = sorted(p.name for p in tmp_path.iterdir())
+    assert made == ["other.html", "other.png", "other.sources.ecsv", "run.h5"]
     assert invoke(tmp_path, "report", "run.h5", "--out", "other.html")[0] == 2
     (tmp_path / "run.html").write_text("old")
     assert invoke(tmp_path, "report", "run.h5", "--overwrite")[0] == 3

@@ -45,6 +45,7 @@ from bayesfred.reporting.posteriors import (
     trace_plot,
 )
 from bayesfred.reporting.screen import parameter_table
+from bayesfred.reporting.style import embedded
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.summary import summary, unit_text
 
@@ -689,3 +690,10 @@ def test_overview_shows_frame_and_marginals(with_truth: bool) -> None:
     marginals = next(ax for ax in figure.axes if "posterior mean" in ax.get_ylabel())
     assert len(marginals.get_xticks()) == (5 if with_truth else 4)
     pixels(figure)
+
+
+@pytest.mark.parametrize("size", [(7.0, 3.3), (1.0 / 3.0, 2.7182818), (5.25, 4.9999)])
+def test_figures_of_any_size_are_embedded(size: tuple[float, float]) -> None:
+    """A size that is no whole number of pixels is rounded as the renderer rounds it."""
+    image = embedded(Figure(figsize=size, dpi=100))
+    assert abs(image.width - 100 * size[0]) <= 1 and abs(image.height - 100 * size[1]) <= 1

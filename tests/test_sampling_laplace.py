@@ -114,7 +114,7 @@ def test_a_seed_gives_one_chain_and_a_file_keeps_it(
         np.testing.assert_array_equal(chain.chain, written.chain)
         np.testing.assert_array_equal(chain.log_prob, written.log_prob)
     table = read.summary()
-    assert table.colnames == ["name", "unit", "MAP", "mean", "sd"]
+    assert table.colnames == ["name", "unit", "MAP", "mean", "sd", "corner", "corner_sd"]
     sd = np.sqrt(np.diag(estimate.covariance))
     np.testing.assert_allclose(table["sd"], sd, rtol=4 / np.sqrt(2 * 1000))
 

@@ -82,8 +82,8 @@ def embedded(figure: Figure) -> Embedded:
     (200, 100)
     """
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="rgba", dpi="figure", facecolor="white")
-    image = Image.frombytes("RGBA", figure.canvas.get_width_height(), buffer.getvalue())
+    figure.savefig(buffer, dpi="figure", facecolor="white")
+    image = Image.open(buffer)
     # of Pillow's methods the one that keeps rare colours, such as those at a scale's ends
     few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     buffer = io.BytesIO()

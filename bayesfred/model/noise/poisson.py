@@ -97,7 +97,7 @@ class PoissonNoise(Noise):
     >>> PoissonNoise().log_likelihood(np.array([0.0]), np.array([2.0]), 2.0)
     array([-2.])
     >>> PoissonNoise(0.5).log_likelihood(np.array([-0.2, 1.3]), np.array([2.0]), 2.0).round(3)
-    array([-2.095, -1.494])
+    array([-2.191, -1.326])
     """
 
     read_noise: float | Floats = 0.0
