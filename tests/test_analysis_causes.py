@@ -16,7 +16,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
-from bayesfred.model.noise import BackgroundNoise, GaussianNoise
+from bayesfred.model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
@@ -182,3 +182,22 @@ def test_causes_of_odd_frames_are_sentences(name: str) -> None:
         assert 0.0 < cause.share <= 1.0
         text = f"{cause.sentence} {cause.remedy}"
         assert text.isprintable() and "nan" not in text.split()
+
+
+@pytest.mark.parametrize("read_noise", [0.3, np.full(planted.SHAPE, 0.5)])
+def test_read_noise_counts_as_variance(read_noise: Any) -> None:
+    """Information is not its inverse: at 0.05 counts a pixel of sky they differ threefold."""
+    lens, noise = planted.LENS, PoissonNoise(read_noise)
+    model = ForwardModel(
+        Detector(planted.SHAPE), SourceCatalog.grid(5, 25.0, 300.0),
+        GaussianPSF(2.0), lens,
+    )  # fmt: skip
+    params = np.array([*np.zeros(lens.n_terms), 0.05])
+    counts = simulate(model, params[:-1], 0.05, seed=1, noise=noise)
+    posterior = Posterior(model, counts, noise=noise)
+    context = Context(posterior, params, np.zeros(counts.shape, bool))
+    assert abs(context.excess) < 5.0 * context.spread
+    mu, variance = model.expected_counts(params[:-1], 0.05), np.asarray(read_noise) ** 2
+    light = (mu - 0.05) ** 2 / (mu + variance)
+    assert context.power.sum() == pytest.approx(light.sum(), rel=0.02)
+    assert np.isfinite(context.catalogue_power).all()

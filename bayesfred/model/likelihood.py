@@ -237,8 +237,11 @@ class FrameLikelihood:
         level = self._background(parameters.background)
         return sources + level + bad, rendered.fluxes + bad
 
+    def background(self, params: Floats) -> Floats:
+        """The background polynomial at every pixel, shape (ny, nx), counts per pixel."""
+        return self._background(self._one(params).background)
+
     def _background(self, background: Floats) -> Floats:
-        """The background polynomial at every pixel."""
         u, v = (np.arange(1 - n, n, 2) / n for n in self.model.detector.shape[::-1])
         out = np.zeros(self.model.detector.shape)
         for (m, n), value in zip(BACKGROUND_POWERS, background, strict=True):

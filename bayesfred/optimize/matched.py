@@ -103,9 +103,9 @@ def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     position = field.predict(params[field.columns]) / step
     place = (position + 0.5 * (np.array(detector.shape[::-1]) - 1.0))[:, ::-1]
     expected = posterior.expected_counts(params)
-    weight = posterior.noise.fisher_weight(expected, known["background"])
     residual = np.where(posterior.mask, posterior.counts - expected, 0.0)
-    variance = np.where(posterior.mask, 1.0 / weight, 0.0)
+    variance = posterior.noise.counts_variance(expected, known["background"])
+    variance = np.where(posterior.mask, variance, 0.0)
 
     sums = np.zeros((5, len(position)))
     reach = np.arange(-int(np.ceil(3.0 * s)), int(np.ceil(3.0 * s)) + 1)

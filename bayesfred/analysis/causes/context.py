@@ -7,7 +7,6 @@ import numpy as np
 from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats, Ints
-from bayesfred.model.parameters import BACKGROUND_POWERS, BACKGROUND_TERMS
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.matched import SourceLight, source_light
 
@@ -73,8 +72,8 @@ class Context:
     @cached_property
     def variance(self) -> Floats:
         """Of every pixel's counts under the noise model."""
-        weight = self.posterior.noise.fisher_weight(self.expected, self.level)
-        return np.asarray(np.where(np.isfinite(weight) & (weight > 0.0), 1.0 / weight, 1.0))
+        variance = self.posterior.noise.counts_variance(self.expected, self.level)
+        return np.where(np.isfinite(variance) & (variance > 0.0), variance, 1.0)
 
     @cached_property
     def residual(self) -> Floats:
@@ -101,13 +100,7 @@ class Context:
     @cached_property
     def background(self) -> Floats:
         """The background polynomial at every pixel, shape (ny, nx)."""
-        shape = self.expected.shape
-        u, v = (np.arange(1 - n, n, 2) / n for n in shape[::-1])
-        out = np.zeros(shape)
-        known = dict(zip(self.posterior.parameter_names, self.params, strict=True))
-        for name, (m, n) in zip(BACKGROUND_TERMS, BACKGROUND_POWERS, strict=True):
-            out += known.get(name, 0.0) * u**m * v[:, None] ** n
-        return out
+        return self.posterior.likelihood.background(self.params)
 
     @cached_property
     def power(self) -> Floats:
@@ -134,8 +127,8 @@ class Context:
         (B + S), which is F (1 - log(1 + x) / x) with x = F / (2 pi s^2 B); where the noise is not
         the photons', that of S^2 / B, see `missing_power`.
         """
-        photons = self.posterior.noise.fisher_weight(np.array([1e9]), self.level)
-        if np.ravel(photons)[0] > 1e-8:
+        bright = np.full_like(self.expected, 1e9)
+        if self.posterior.noise.counts_variance(bright, self.level).max() < 1e8:
             return self.missing_power
         x = self._contrast
         return np.asarray(self.flux * (1.0 - np.log1p(x) / np.maximum(x, 1e-12)))

@@ -15,8 +15,6 @@ OUTLYING = 6.0  # times the typical misfit of a source as bright
 NOTICEABLE = 6.0  # standard deviations
 NAMED = 5  # sources listed
 RINGS, REACH = 8, 4.0  # of the PSF's residual, and their outer radius in PSF widths
-ACROSS = 13  # cells of the residual's map along each axis, where sources are many
-MANY = 20  # sources for each cell
 
 
 def fluxes(context: Context) -> Finding | None:
