@@ -83,6 +83,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         sigma=lambda params: model.expected_counts(params[:4], params[4]) ** 0.5,
     )
     posterior.parameters = described(*names)
+    posterior.likelihood = Posterior(model, counts).likelihood
     estimate = SimpleNamespace(
         params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9
     )

@@ -240,17 +240,13 @@ def _sd(covariance: Floats) -> Floats:
 
 def _images(posterior: Posterior, params: Floats) -> Floats:
     """Where the sources are imaged on pixels of the likelihood, shape (n, 2), pixel."""
-    model = posterior.model
-    theta, offset = displacing(posterior.parameters, params)
-    at = np.stack(
-        model.polynomial.image_position(theta, model.sources.x, model.sources.y, offset=offset)
-    )
-    at = at[:, np.isfinite(at).all(axis=0)]
-    shape = np.array(model.detector.shape[::-1])[:, None]
-    pixel = np.rint(at / model.detector.binning + 0.5 * (shape - 1.0))
-    kept = ((pixel >= 0.0) & (pixel < shape)).all(axis=0)
-    column, row = pixel[:, kept].astype(int)
-    return at[:, kept][:, posterior.mask[row, column]].T
+    detector, at = posterior.model.detector, posterior.likelihood.image_positions(params)
+    at = at[np.isfinite(at).all(axis=1)]
+    shape = np.array(detector.shape[::-1])
+    pixel = np.rint(at / detector.binning + 0.5 * (shape - 1.0))
+    kept = ((pixel >= 0.0) & (pixel < shape)).all(axis=1)
+    column, row = pixel[kept].astype(int).T
+    return np.asarray(at[kept][posterior.mask[row, column]])
 
 
 def _hull(images: Floats) -> Floats:

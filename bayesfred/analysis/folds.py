@@ -20,10 +20,8 @@ import numpy as np
 from scipy import spatial
 
 from bayesfred._typing import Flags, Floats, Ints
-from bayesfred.imaging.kernels.geometry import image_positions
+from bayesfred.analysis.field import field_points
 from bayesfred.model.posterior import Posterior
-
-GRID = 17  # points along each axis of the frame at which fields are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +68,11 @@ def fold_sources(posterior: Posterior, params: Floats, number: int) -> Folds:
     -------
     Folds
     """
-    positions = _positions(posterior, params)
+    positions = posterior.likelihood.image_positions(params)
     ny, nx = posterior.model.detector.shape
     step = posterior.model.detector.binning
-    pixel = np.rint(positions / step + 0.5 * (np.array([nx, ny]) - 1.0)).astype(int)
+    pixel = np.rint(positions / step + 0.5 * (np.array([nx, ny]) - 1.0))
+    pixel = np.nan_to_num(pixel, nan=-1.0).astype(int)  # without an image, in no pixel
     column, row = np.clip(pixel, 0, [nx - 1, ny - 1]).T
     seen = np.all(pixel == np.stack([column, row], axis=1), axis=1)
     seen &= posterior.mask[row, column]
@@ -84,20 +83,11 @@ def fold_sources(posterior: Posterior, params: Floats, number: int) -> Folds:
     if there.size:
         owner = _owners(posterior, params, positions[there], posterior.fluxes(params)[there])
         pixels[posterior.mask] = sources[there][owner]
-    return Folds(sources, pixels, _field_points(posterior, positions[there]))
+    return Folds(sources, pixels, _field_points(posterior, params, positions[there]))
 
 
 def _masked(posterior: Posterior, mask: Flags) -> Posterior:
     return replace(posterior, mask=mask, extrapolation=None)
-
-
-def _positions(posterior: Posterior, params: Floats) -> Floats:
-    """Image positions (u, v) of the sources, shape (n, 2), fine pixel."""
-    model = posterior.model
-    known = dict(zip(posterior.parameter_names, params, strict=True))
-    theta = model.polynomial.monomial_coefficients(params[: model.distortion.n_terms].copy())
-    offset = [known.get(name, 0.0) for name in ("offset_x", "offset_y")]
-    return np.asarray(image_positions(model.optics(), theta, *offset, model.psf.sigma))
 
 
 def _path(positions: Floats) -> Ints:
@@ -122,12 +112,7 @@ def _owners(posterior: Posterior, params: Floats, positions: Floats, flux: Float
     return np.asarray(spatial.cKDTree(lifted).query(pixels)[1])
 
 
-def _field_points(posterior: Posterior, positions: Floats) -> Floats:
-    half = 0.5 * np.array(posterior.model.detector.fine_shape[::-1], dtype=np.float64)
-    axes = np.meshgrid(*(np.linspace(-h, h, GRID) for h in half))
-    grid = np.stack([axis.ravel() for axis in axes], axis=1)
-    try:
-        inside = spatial.Delaunay(positions).find_simplex(grid) >= 0
-    except (ValueError, spatial.QhullError):  # no point, or all on a line
-        return positions
-    return grid[inside] if inside.any() else positions
+def _field_points(posterior: Posterior, params: Floats, positions: Floats) -> Floats:
+    points = field_points(posterior, params)
+    grid = np.stack([points.u[points.inside], points.v[points.inside]], axis=1)
+    return grid if len(grid) else positions

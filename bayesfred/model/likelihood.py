@@ -44,6 +44,7 @@ from bayesfred.model.parameters import (
     SOURCE_NUISANCES,
     Nuisances,
     Parameter,
+    displacing,
 )
 from bayesfred.model.threads import share
 
@@ -236,6 +237,12 @@ class FrameLikelihood:
         bad = 0.0 if rendered.extra > -np.inf else np.nan
         level = self._background(parameters.background)
         return sources + level + bad, rendered.fluxes + bad
+
+    def image_positions(self, params: Floats) -> Floats:
+        """Where the sources are imaged, shape (s, 2), fine pixel; nan without an image."""
+        theta, offset = displacing(self.parameters, params)
+        d, s = self.model.polynomial, self.model.sources
+        return np.stack(d.image_position(theta, s.x, s.y, offset=offset), axis=1)
 
     def background(self, params: Floats) -> Floats:
         """The background polynomial at every pixel, shape (ny, nx), counts per pixel."""

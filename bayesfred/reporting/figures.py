@@ -147,7 +147,7 @@ def _posterior_figures(
     caption = "Contours hold 39 % and 86 % of the draws."
     if rest:
         caption += (
-            f" {len(shown)} of {draws.shape[1]} parameters; `report --corner NAME,NAME,...` shows "
+            f" {len(shown)} of {draws.shape[1]} parameters: report --corner NAME,NAME,... shows "
             "others."
         )
     figures = [
@@ -262,9 +262,7 @@ def _star_positions(chain: Chain, posterior: Posterior) -> tuple[Floats, Floats,
     """Images of the sources in recorded pixels from the middle, and a stamp's half-width."""
     model = posterior.model
     params = dict(zip(chain.parameter_names, chain.estimate.params, strict=True))
-    theta = chain.estimate.params[: model.distortion.n_terms]
-    offset = params.get("offset_x", 0.0), params.get("offset_y", 0.0)
-    u, v = model.polynomial.image_position(theta, model.sources.x, model.sources.y, offset=offset)
+    u, v = posterior.likelihood.image_positions(chain.estimate.params).T
     binning = model.detector.binning
     half_width = max(4, math.ceil(3.5 * params.get("psf_sigma", model.psf.sigma) / binning))
     return u / binning, v / binning, half_width

@@ -182,11 +182,7 @@ def source_of_pixels(posterior: Posterior, params: Floats) -> Ints:
         Index in the catalogue; the number of sources where there is none.
     """
     model = posterior.model
-    theta = params[: model.distortion.n_terms]
-    given = dict(zip(posterior.parameter_names, params, strict=True))
-    x = model.sources.x + given.get("offset_x", 0.0)
-    y = model.sources.y + given.get("offset_y", 0.0)
-    images = np.stack(model.distortion.image_position(theta, x, y), axis=1)
+    images = posterior.likelihood.image_positions(params)
     imaged = np.flatnonzero(np.isfinite(images).all(axis=1))
     u, v = _pixels(posterior)
     rows, columns = np.nonzero(posterior.mask)
