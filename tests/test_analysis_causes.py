@@ -44,8 +44,7 @@ def named_first(name: str, seeds: range) -> int:
 
 @pytest.mark.parametrize("name", planted.FAULTS)
 def test_planted_fault_is_named_first(name: str) -> None:
-    """In one of two frames at least: at the rate of 0.9 that is demanded both fail once in 100."""
-    assert named_first(name, range(101, 103)) >= 1
+    assert named_first(name, range(101, 103)) == 2
 
 
 @pytest.mark.statistics

@@ -128,7 +128,9 @@ def _refine(
     half = 0.5 * np.array(context.expected.shape[::-1])
     seen = (np.abs(predicted) < half).all(axis=1)
     by_chance = seen.sum() * min(1.0, len(peaks) * np.pi * tolerance**2 / area)
-    if pairs.shape[1] < max(FEWEST, 0.5 * seen.sum(), 1.5 * by_chance):
+    # as many pairs as there are terms lie on the polynomial whatever they are
+    terms = 10 if degree == 3 else 3
+    if pairs.shape[1] - terms < max(0.5 * (seen.sum() - terms), 1.5 * by_chance):
         return None
     return Placement(pairs[0], peaks[pairs[1]], affine[1:].T, affine[0])
 
