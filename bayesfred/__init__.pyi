@@ -7,7 +7,8 @@ from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
 from .analysis.photons import PhotonsNeeded, photons_needed
-from .analysis.sbc import PosteriorCalibration, calibrate_posterior
+from .analysis.prior_predictive import PriorPredictive, prior_predictive
+from .analysis.sbc import SBCResult, simulation_based_calibration
 from .errors import InputError
 from .imaging.catalog import SourceCatalog
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
@@ -50,12 +51,12 @@ __all__ = [
     "PoissonNoise",
     "PolynomialDistortion",
     "Posterior",
-    "PosteriorCalibration",
+    "PriorPredictive",
     "RunRecord",
+    "SBCResult",
     "SampledPSF",
     "SourceCatalog",
     "TermChoice",
-    "calibrate_posterior",
     "choose_terms",
     "commands",
     "compare",
@@ -69,9 +70,11 @@ __all__ = [
     "noise_study",
     "open_chain",
     "photons_needed",
+    "prior_predictive",
     "reject_outliers",
     "sample",
     "sampling_matrix",
     "show",
     "simulate",
+    "simulation_based_calibration",
 ]

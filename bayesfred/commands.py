@@ -19,7 +19,7 @@ from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.photons import photons_needed
-from bayesfred.analysis.sbc import PosteriorCalibration, calibrate_posterior
+from bayesfred.analysis.sbc import SBCResult, simulation_based_calibration
 from bayesfred.errors import InputError
 from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
@@ -242,14 +242,14 @@ def study(
         }  # fmt: skip
         if kind == "noise" and simulation is not None and truth is not None:
             model = posterior.model
-            result: NoiseStudy | PosteriorCalibration = noise_study(
+            result: NoiseStudy | SBCResult = noise_study(
                 model, truth[: model.distortion.n_terms], s.background or simulation.background,
                 flux=s.flux or (), sources=s.sources or (), psf_sigma=s.psf_sigma or (),
                 exposure=s.exposure or (), method=s.method or "laplace", noise=posterior.noise,
                 nuisances=posterior.nuisances, prior=build.priors_given(run), error=s.error, **how,
             )  # fmt: skip
         else:
-            result = calibrate_posterior(posterior, method=s.method or "mcmc", **how)
+            result = simulation_based_calibration(posterior, method=s.method or "mcmc", **how)
     return pipeline.write_study(result, posterior, table)
 
 

@@ -17,7 +17,7 @@ from bayesfred.analysis.choose_terms import choose_terms
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.field import displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
-from bayesfred.analysis.sbc import PosteriorCalibration
+from bayesfred.analysis.sbc import SBCResult
 from bayesfred.errors import InputError, printable
 from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.model.posterior import Posterior
@@ -314,14 +314,12 @@ def naming(run_file: Path) -> Iterator[None]:
         raise InputError(f"{run_file}: {error}") from None
 
 
-def write_study(
-    result: NoiseStudy | PosteriorCalibration, posterior: Posterior, table: Path
-) -> Study:
+def write_study(result: NoiseStudy | SBCResult, posterior: Posterior, table: Path) -> Study:
     """Write the summary and the figure of a study beside its table.
 
     Parameters
     ----------
-    result : NoiseStudy or PosteriorCalibration
+    result : NoiseStudy or SBCResult
     posterior : Posterior
         Of one of its frames.
     table : Path

@@ -9,7 +9,7 @@ from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.analysis.field import DisplacementField
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.photons import PhotonsNeeded
-from bayesfred.analysis.sbc import PosteriorCalibration
+from bayesfred.analysis.sbc import SBCResult
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
@@ -73,12 +73,12 @@ class Study:
 
     Attributes
     ----------
-    result : NoiseStudy or PosteriorCalibration
+    result : NoiseStudy or SBCResult
     table, summary, picture : Path
         The files: a row for each frame, the findings, their figure.
     """
 
-    result: NoiseStudy | PosteriorCalibration
+    result: NoiseStudy | SBCResult
     table: Path
     summary: Path
     picture: Path
@@ -86,7 +86,7 @@ class Study:
     @property
     def holds(self) -> bool:
         """Whether every frame could be fitted or, in a calibration, the error bars hold."""
-        if isinstance(self.result, PosteriorCalibration):
+        if isinstance(self.result, SBCResult):
             return self.result.calibrated
         return not self.result.cells["failed"].any()
 

@@ -27,8 +27,8 @@ FRAMES = 50
 
 def judged(posterior: Posterior) -> Any:
     """The verdict on the fit at the maximum."""
-    params = find_map(posterior).params
-    return judge_fit(posterior, params, fit_statistics(posterior, params))
+    estimate = find_map(posterior)
+    return judge_fit(posterior, estimate, fit_statistics(posterior, estimate.params))
 
 
 def named_first(name: str, seeds: range) -> int:

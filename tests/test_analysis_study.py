@@ -538,6 +538,7 @@ def small(
     widen: float = 1.0,
     conserve_flux: bool = True,
     free: bool = False,
+    psf_sigma: bool = False,
 ) -> bf.Posterior:
     """Nine sources and four terms, two of them with priors that matter."""
     distortion = bf.PolynomialDistortion(
@@ -556,8 +557,9 @@ def small(
     prior["background"] = stats.gamma(4.0, scale=background / 4.0)
     frame = model.expected_counts(np.zeros(4), background)
     return bf.Posterior(
-        model, frame, prior=prior, nuisances=bf.Nuisances("free" if free else "fixed")
-    )
+        model, frame, prior=prior,
+        nuisances=bf.Nuisances("free" if free else "fixed", psf_sigma=psf_sigma),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -588,7 +590,7 @@ def test_truth_is_ranked_among_the_draws(tmp_path: Path) -> None:
     study = sbc._Calibration(posterior, posterior, "mcmc", 1)
     row = dict(zip(study.columns, study.task(2), strict=True))
     for_truth, for_draws, for_ranks = seeds(1, 2).spawn(3)
-    truth, counts = study.truth(np.random.default_rng(for_truth))
+    truth, _, counts = study.truth(np.random.default_rng(for_truth))
     assert row["f_ux.truth"] == truth[0]
     fit = given(posterior, counts)
     draws = study.drawn(fit, for_draws)
@@ -597,10 +599,9 @@ def test_truth_is_ranked_among_the_draws(tmp_path: Path) -> None:
     assert below <= row["f_ux.pit"] * (len(draws) + 1) <= below + 1
     likelihood = fit.log_prob(draws) - fit.log_prior(draws)
     assert row["log_likelihood.mean"] == pytest.approx(likelihood.mean(), rel=1e-12)
-    f, g = posterior.model.distortion.displacement(truth[:4], 14.0, 8.0, 14.0, 8.0)
-    assert (row["f(+14, +8).truth"], row["g(+14, +8).truth"]) == pytest.approx(
-        (float(f), float(g)), rel=1e-12
-    )
+    x, y = posterior.model.polynomial.object_position(truth[:4], 20.0, -20.0)
+    corner = row["displacement_x(+20, -20).truth"], row["displacement_y(+20, -20).truth"]
+    assert corner == pytest.approx((20.0 - float(x), -20.0 - float(y)), rel=1e-12)
     assert np.random.default_rng(for_ranks).random(1).size == 1
 
 
@@ -609,7 +610,7 @@ def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> No
 
     Draws there are left out.
     """
-    dark = bf.calibrate_posterior(
+    dark = bf.simulation_based_calibration(
         small(background=0.001),
         replicates=3,
         method="laplace",
@@ -631,7 +632,7 @@ def test_right_error_bars_are_found_right_and_wrong_ones_wrong(tmp_path: Path) -
     Their sources are so bright that every frame shows a determinant that is missing.
     """
     right, wrong = (
-        bf.calibrate_posterior(
+        bf.simulation_based_calibration(
             small(flux=2e4), fitted=small(flux=2e4, conserve_flux=conserve), replicates=30,
             path=tmp_path / f"{conserve}.ecsv", seed=1, workers=1, progress=False,
         )
@@ -648,7 +649,7 @@ def test_right_error_bars_are_found_right_and_wrong_ones_wrong(tmp_path: Path) -
 
 def test_frames_without_a_posterior_are_no_calibration(tmp_path: Path) -> None:
     """Of sources of a photon nothing can be found."""
-    result = bf.calibrate_posterior(
+    result = bf.simulation_based_calibration(
         small(background=100.0, flux=1.0),
         replicates=3,
         path=tmp_path / "s.ecsv",
@@ -659,16 +660,18 @@ def test_frames_without_a_posterior_are_no_calibration(tmp_path: Path) -> None:
     assert not result.calibrated
     assert (result.n, result.n_failed) == (0, 3)
     assert "no posterior of 3 frames" in result.message
+    assert all(column.size == 0 for column in result.quantities.values())
+    assert {"uniformity", "coverage_68", "pull"} < set(result.quantities)
     assert png(calibration_plot(result, small().parameters)).startswith(b"\x89PNG")
 
 
 def test_calibrations_that_cannot_be_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="fitted"):
-        bf.calibrate_posterior(
+        bf.simulation_based_calibration(
             small(), fitted=everything(tiny(), bf.PoissonNoise()), path=tmp_path / "s.ecsv", seed=1
         )
     folding = bf.Posterior(tiny(), np.ones((31, 31)), prior={"f_ux": stats.norm(-0.5, 0.01)})
-    result = bf.calibrate_posterior(
+    result = bf.simulation_based_calibration(
         folding, replicates=2, path=tmp_path / "s.ecsv", seed=1, workers=1, progress=False
     )
     assert "fold" in result.message
@@ -803,6 +806,8 @@ CASES: dict[str, dict[str, Any]] = {
     "two counts a pixel": {},
     "a tenth of a count a pixel": {"background": 0.1, "flux": 200.0},
     "free fluxes": {"free": True},
+    "the PSF's width": {"psf_sigma": True},
+    "free fluxes and the PSF's width": {"free": True, "psf_sigma": True},
 }
 
 
@@ -810,7 +815,7 @@ CASES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_error_bars_hold(tmp_path: Path, case: str) -> None:
     """Intervals and mean pulls of every parameter within three standard errors, and the verdict."""
-    result = bf.calibrate_posterior(
+    result = bf.simulation_based_calibration(
         small(**CASES[case]), replicates=N, path=tmp_path / "s.ecsv", seed=1, progress=False
     )
     assert result.calibrated, result.message

@@ -272,3 +272,49 @@ def test_the_same_is_left_out_wherever_the_search_begins(seed: int) -> None:
     off[: COMPLETE.n_terms] += 0.01 * Field(posterior).scale
     assert not np.array_equal(reject_once(posterior, off).posterior.mask, mine.mask)
     assert np.array_equal(reject(posterior, off)[0].missing, reject_once(posterior, truth).missing)
+
+
+def crowded(seed: int) -> tuple[Posterior, Floats]:
+    """196 stars 2.6 widths apart, a tenth of them missing and as many foreign ones."""
+    rng = np.random.default_rng(seed)
+    grid = SourceCatalog.grid(14, 5.2, 1e3)
+    terms = [(1, 0, 1, 0), (1, 0, 0, 1), (2, 0, 1, 0)], [(0, 1, 0, 1), (0, 1, 1, 0), (0, 2, 0, 1)]
+    detector, distortion = Detector((101, 101)), PolynomialDistortion(*terms)
+    model = ForwardModel(detector, grid, GaussianPSF(2.0), distortion)
+    priors = Posterior(model, np.ones((101, 101))).prior.values()
+    while True:  # until a map is not folded
+        theta = 3.0 * np.array([p.std() for p in list(priors)[:6]]) * rng.standard_normal(6)
+        there = np.sort(rng.permutation(196)[20:])
+        kept = SourceCatalog(grid.x[there], grid.y[there], grid.flux[there])
+        mean = replace(model, sources=kept).expected_counts(theta) + 2.0
+        if np.all(np.isfinite(mean)):
+            break
+    spots = SourceCatalog(*rng.uniform(-45.0, 45.0, (2, 20)), np.full(20, 1e3))
+    mean += replace(model, sources=spots).expected_counts(np.zeros(6))
+    return Posterior(model, rng.poisson(mean).astype(float)), np.append(theta, 2.0)
+
+
+@pytest.mark.statistics
+def test_crowded_fields_are_right_or_said_not_to_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """40 frames in which half of the field can be taken for outliers.
+
+    What is said to fit is at the truth: of the seven parameters none is off by ten standard
+    deviations, as all are that were found half a pitch away.
+    """
+
+    def off(said: MapEstimate, truth: Floats) -> float:
+        return float(np.abs((said.params - truth) / np.sqrt(np.diag(said.covariance))).max())
+
+    right, silent = 0, 0
+    for seed in range(40):
+        posterior, truth = crowded(seed)
+        with monkeypatch.context() as patched:
+            _, estimate = reject_outliers(posterior)
+            patched.setattr("bayesfred.optimize.find_map.BREAKDOWN", 1.0)  # negative control
+            _, careless = reject_outliers(posterior)
+        wrong = off(estimate, truth) > 10.0
+        right += not wrong and estimate.fits_data
+        silent += off(careless, truth) > 10.0 and careless.fits_data
+        assert not (wrong and estimate.fits_data), f"seed {seed}: {estimate.message}"
+    assert right >= 20
+    assert silent >= 1

@@ -249,7 +249,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         efficiency = importance_efficiency(chain)
         sampling = judge_approximation(chain, efficiency)
     fit = fit_statistics(posterior, chain.estimate.params)
-    fitted = judge_fit(posterior, chain.estimate.params, fit)
+    fitted = judge_fit(posterior, chain.estimate, fit)
     residuals, checks = None, sums(fit)
     if isinstance(posterior, Posterior):
         residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)

@@ -26,6 +26,8 @@ from scipy.special import erfc
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.ecdf_bands import uniformity
 from bayesfred.analysis.executor import Executor, run
+from bayesfred.analysis.flux_draws import draw_fluxes
+from bayesfred.analysis.prior_predictive import drawn_from_prior
 from bayesfred.analysis.study_helpers import (
     LEVELS,
     Method,
@@ -38,17 +40,22 @@ from bayesfred.analysis.study_helpers import (
     seeds,
 )
 from bayesfred.errors import InputError
+from bayesfred.model.parameters import displacing
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chainfile import fingerprint
 
-__all__ = ["PosteriorCalibration", "calibrate_posterior"]
+__all__ = ["SBCResult", "simulation_based_calibration"]
 
 RANKED = 200  # draws among which a truth is ranked, at least
 
-# Field points, in half-widths of the frame, where the displacement is judged.
-FIELD_POINTS = ((0.7, 0.4), (-0.4, 0.7), (0.9, -0.9))
+# Field points, in half-widths of the frame, where the displacement is judged: the last is a corner.
+FIELD_POINTS = ((0.7, 0.4), (-0.4, 0.7), (1.0, -1.0))
 
-REDRAWS = 1000
+COLUMNS = (
+    "quantity", "uniformity", *(
+        f"coverage_{100 * level:.0f}{error}" for level in LEVELS for error in ("", "_error")
+    ), "bias", "bias_error", "pull", "pull_error",
+)  # fmt: skip
 FALSE_ALARM = 0.01  # how often the verdict may refuse error bars that hold
 MOST_FAILED = 0.01  # share of frames without a posterior beyond which the others say nothing
 
@@ -66,30 +73,40 @@ class _Calibration:
     method: Method
     seed: int
 
-    @property
+    @cached_property
     def quantities(self) -> tuple[str, ...]:
         """What is ranked."""
-        return (*self.posterior.parameter_names, "log_likelihood", *self._field)
+        places = (
+            f"displacement_{axis}({u:+.0f}, {v:+.0f})"
+            for axis in self._axes
+            for u, v in self._places
+        )
+        fluxes = (f"flux({s})" for s in self._sources)
+        return (*self.posterior.parameter_names, "log_likelihood", *places, *fluxes)
 
     @cached_property
-    def _field(self) -> dict[str, Floats]:
-        """f and g at points of the field, as far as they depend on theta.
+    def _places(self) -> Floats:
+        """Image points where the displacement is judged, shape (n, 2), fine pixel."""
+        return 0.5 * (np.array(self.posterior.model.detector.fine_shape[::-1]) - 1) * FIELD_POINTS
 
-        They are linear in theta, with these factors.
-        """
-        distortion = self.posterior.model.polynomial
-        places = np.rint(
-            0.5 * np.array(self.posterior.model.detector.fine_shape[::-1]) * FIELD_POINTS
+    @cached_property
+    def _axes(self) -> str:
+        """Those along which anything can be displaced."""
+        distortion, names = self.posterior.model.polynomial, self.posterior.parameter_names
+        moved = distortion.design_matrix(*[self._places[:, i % 2] for i in range(4)])
+        return "".join(
+            axis
+            for axis, factors in zip("xy", moved, strict=True)
+            if factors.any() or f"offset_{axis}" in names
         )
-        field: dict[str, Floats] = {}
-        for u, v in places:
-            both = distortion.design_matrix(u, v, u, v)
-            field |= {
-                f"{letter}({u:+.0f}, {v:+.0f})": factors
-                for letter, factors in zip("fg", both, strict=True)
-                if factors.any()
-            }
-        return field
+
+    @cached_property
+    def _sources(self) -> tuple[int, ...]:
+        """Those whose fluxes are judged: the faintest, the median and the brightest."""
+        if self.fitted.nuisances.profiled != 1:
+            return ()
+        order = np.argsort(self.posterior.model.sources.flux, kind="stable")
+        return tuple(dict.fromkeys(order[[0, order.size // 2, -1]].tolist()))
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -109,12 +126,19 @@ class _Calibration:
 
     def task(self, k: int) -> Sequence[float]:
         for_truth, for_draws, for_ranks = seeds(self.seed, k).spawn(3)
-        truth, counts = self.truth(np.random.default_rng(for_truth))
-        posterior = given(self.fitted, counts)
-        drawn = self._judged(posterior, self.drawn(posterior, for_draws))
+        truth, fluxes, counts = self.truth(np.random.default_rng(for_truth))
+        posterior, rng = given(self.fitted, counts), np.random.default_rng(for_ranks)
+        params = self.drawn(posterior, for_draws)
+        drawn = self._judged(posterior, params)
         true = self._judged(posterior, truth[None])[0]
+        if self._sources:
+            some = list(self._sources)
+            light = np.array([draw_fluxes(posterior, each, rng)[some] for each in params])
+            drawn, true = np.hstack([drawn, light]), np.append(true, fluxes[some])
+        if not (np.all(np.isfinite(drawn)) and np.all(np.isfinite(true))):
+            raise InputError("displacement: got none at some point of the field, expected one")
         below, equal = (drawn < true).sum(axis=0), (drawn == true).sum(axis=0)
-        jitter = np.random.default_rng(for_ranks).random(true.size)
+        jitter = rng.random(true.size)
         pit = (below + jitter * (equal + 1)) / (len(drawn) + 1)
         each = np.stack([true, drawn.mean(axis=0), drawn.std(axis=0, ddof=1), pit], axis=1)
         return (len(drawn), *each.ravel())
@@ -123,34 +147,27 @@ class _Calibration:
         """The posterior's draws."""
         return draws(posterior, maximum(posterior), self.method, seed, RANKED)
 
-    def truth(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Parameters from the prior and a frame of theirs.
-
-        They are drawn again where a map folds, as such parameters have no prior probability.
-        """
-        for _ in range(REDRAWS):
-            truth = np.array(
-                [prior.rvs(random_state=rng) for prior in self.posterior.prior.values()]
-            )
-            counts = self.posterior.simulate(truth, rng)
-            if counts is not None:
-                return truth, counts
-        raise InputError(
-            f"prior: got {REDRAWS} draws that all fold a source's image, expected some that do "
-            "not: narrow it"
-        )
+    def truth(self, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+        """Parameters and fluxes from their priors, and a frame of theirs."""
+        likelihood = self.posterior.likelihood
+        fluxes = self.posterior.model.sources.flux
+        if self.posterior.nuisances.flux == "free":
+            fluxes = likelihood.flux_prior().rvs(random_state=rng)
+        params, counts = drawn_from_prior(self.posterior, rng, fluxes)
+        return params, fluxes, counts
 
     def _judged(self, posterior: Posterior, params: Floats) -> Floats:
-        """The quantities that are ranked, shape (n, number)."""
+        """The quantities that are ranked, fluxes left out, shape (n, number)."""
         likelihood = posterior.log_prob(params) - posterior.log_prior(params)
-        theta = params[:, : self.posterior.model.distortion.n_terms]
-        return np.stack(
-            [*params.T, likelihood, *(theta @ factors for factors in self._field.values())], axis=1
-        )
+        theta, offset = displacing(posterior.parameters, params)
+        u, v = self._places.T
+        x, y = posterior.model.polynomial.object_position(theta, u, v, offset=offset)
+        moved = {"x": u - x, "y": v - y}
+        return np.hstack([params, likelihood[:, None], *(moved[axis] for axis in self._axes)])
 
 
 @dataclass(frozen=True, eq=False)
-class PosteriorCalibration:
+class SBCResult:
     """Whether a posterior's error bars hold.
 
     Attributes
@@ -167,9 +184,11 @@ class PosteriorCalibration:
         Frames that have none.
     pit : dict of str to ndarray, shape (n,)
         Randomised ranks of the truths, between 0 and 1, by quantity: every parameter, the
-        log-likelihood, and f and g at field points (pixel).
+        log-likelihood, the displacement at points of the image, of which the last is a corner
+        (fine pixel), and free fluxes of the faintest, the median and the brightest source (counts).
     quantities : dict of str to ndarray
-        A row for each of them: see `calibrate_posterior`.
+        A row for each of them: see `simulation_based_calibration`. Without rows where no frame has
+        a posterior.
     """
 
     path: Path
@@ -181,7 +200,7 @@ class PosteriorCalibration:
     quantities: dict[str, npt.NDArray[Any]]
 
 
-def calibrate_posterior(
+def simulation_based_calibration(
     posterior: Posterior,
     *,
     fitted: Posterior | None = None,
@@ -194,14 +213,14 @@ def calibrate_posterior(
     resume: bool = False,
     overwrite: bool = False,
     progress: bool = True,
-) -> PosteriorCalibration:
+) -> SBCResult:
     """Simulation-based calibration: rank truths from the prior among the posterior's draws.
 
     Of each frame at least 200 draws an autocorrelation time apart are kept. With randomised ranks,
     the share of draws below the truth is exactly uniform if and only if truth and draws come from
     one distribution.
 
-    Every row of `PosteriorCalibration.quantities` has the quantity's name; uniformity, the p-value
+    Every row of `SBCResult.quantities` has the quantity's name; uniformity, the p-value
     of its ranks' whole distribution function; coverage_68 and coverage_95, the shares of central
     intervals that hold the truth, with their binomial errors; bias, the mean of (posterior mean -
     truth) with its error; pull, the mean of that difference over the posterior's sd, and
@@ -227,7 +246,7 @@ def calibrate_posterior(
 
     Returns
     -------
-    PosteriorCalibration
+    SBCResult
 
     Raises
     ------
@@ -251,7 +270,7 @@ def calibrate_posterior(
     ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
     >>> posterior = bf.Posterior(model, bf.simulate(model, [0.0], 2.0, seed=1))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     study = calibrate_posterior(
+    ...     study = simulation_based_calibration(
     ...         posterior, replicates=20, path=f"{folder}/sbc.ecsv", seed=1, workers=1,
     ...         progress=False)
     >>> study.calibrated, study.n, study.quantities["quantity"][:3].tolist()
@@ -277,7 +296,7 @@ def calibrate_posterior(
     )
 
 
-def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCalibration:
+def _calibrate(study: _Calibration, replicates: int, **how: Any) -> SBCResult:
     """Run a calibration's tasks and judge them."""
     meta = {"study": "sbc", "seed": study.seed, "method": study.method, "replicates": replicates}
     rows = run(study, replicates, meta=meta, **how).columns
@@ -287,9 +306,8 @@ def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCal
     if n < 2:
         reason = rows["message"][~good][0]
         message = f"not calibrated: no posterior of {n_failed} frames ({reason})"
-        return PosteriorCalibration(
-            path, False, message, n, n_failed, {}, {"quantity": np.empty(0, "U1")}
-        )
+        nothing = {name: np.empty(0, "U1" if name == "quantity" else float) for name in COLUMNS}
+        return SBCResult(path, False, message, n, n_failed, {}, nothing)
     table: list[dict[str, Any]] = []
     pits: dict[str, Floats] = {}
     checks: list[tuple[float, str]] = []
@@ -331,8 +349,8 @@ def _calibrate(study: _Calibration, replicates: int, **how: Any) -> PosteriorCal
         "likely has a chance of "
         f"{min(least, 1.0):.2g} among as many"
     )  # fmt: skip
-    columns = {key: np.array([row[key] for row in table]) for key in table[0]}
-    return PosteriorCalibration(path, not reasons, message, n, n_failed, pits, columns)
+    columns = {key: np.array([row[key] for row in table]) for key in COLUMNS}
+    return SBCResult(path, not reasons, message, n, n_failed, pits, columns)
 
 
 def _chance(z: float) -> float:

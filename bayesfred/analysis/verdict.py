@@ -14,6 +14,7 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.analysis.causes import Cause, find_causes
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.sampling.chain import Chain
@@ -47,17 +48,18 @@ class FitVerdict:
     omitted: str
 
 
-def judge_fit(posterior: Any, params: Floats, fit: Mapping[str, float]) -> FitVerdict:
+def judge_fit(posterior: Any, estimate: MapEstimate, fit: Mapping[str, float]) -> FitVerdict:
     """Judge whether a model fits the counts at its maximum.
 
     It does where deviance and Pearson's statistic are within 5 standard deviations of their
-    expectations, and enough sources are matched, see `bayesfred.optimize.matched`.
+    expectations, enough sources are matched, see `bayesfred.optimize.matched`, and the maximum was
+    not found by rejecting most of them.
 
     Parameters
     ----------
     posterior : Posterior
         Of another density with counts only the sums are judged.
-    params : ndarray, shape (d,)
+    estimate : MapEstimate
     fit : mapping of str to float
         See `fit_statistics`.
 
@@ -65,7 +67,8 @@ def judge_fit(posterior: Any, params: Floats, fit: Mapping[str, float]) -> FitVe
     -------
     FitVerdict
     """
-    fits, causes, matched = consistent(fit), tuple[Cause, ...](), ""
+    params, causes, matched = estimate.params, tuple[Cause, ...](), ""
+    fits = consistent(fit)
     if isinstance(posterior, Posterior):
         light = source_light(posterior, params)
         enough = enough_matched(posterior, light)
@@ -74,7 +77,9 @@ def judge_fit(posterior: Any, params: Floats, fit: Mapping[str, float]) -> FitVe
         if not fits:
             causes = find_causes(posterior, params)
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
-    if fits:
+    if fits and not estimate.fits_data:
+        fits, sentence = False, f"The model does not fit all counts: {estimate.message}."
+    elif fits:
         sentence = f"The model fits the counts: {sums} expectation{matched}."
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from scipy import stats
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
@@ -200,8 +201,16 @@ class FrameLikelihood:
         level = self._background(parameters.background)
         return own, sources + level, fluxes, shifts
 
-    def simulate(self, params: Floats, rng: np.random.Generator) -> Floats | None:
-        """Draw a frame given the parameters, free fluxes and the sources' shifts from their priors.
+    def flux_prior(self, which: int | slice = slice(None)) -> Any:
+        """The prior of the fluxes of some sources, where they are free, counts."""
+        return stats.gamma(2.0, scale=0.5 * self._flux[which])
+
+    def simulate(
+        self, params: Floats, rng: np.random.Generator, fluxes: Floats | None = None
+    ) -> Floats | None:
+        """Draw a frame given the parameters, and the sources' shifts from their prior.
+
+        Free fluxes are drawn from theirs unless they are given, shape (s,).
 
         Returns
         -------
@@ -212,7 +221,7 @@ class FrameLikelihood:
         theta, nuisances, background = self._one(params)
         flux = nuisances.flux_scale * self._flux
         if self._free:
-            flux = self._flux * rng.gamma(2.0, 0.5, self._flux.size)
+            flux = self.flux_prior().rvs(random_state=rng) if fluxes is None else fluxes
         ny, nx = self.model.detector.shape
         optics, out = self._optics, np.zeros(ny * stride(nx))
         at_rest = nuisances._replace(position_scatter=0.0)

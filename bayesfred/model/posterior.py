@@ -235,9 +235,14 @@ class Posterior(TargetDensity):
             return self
         return replace(self, extrapolation=close.extrapolation)
 
-    def simulate(self, params: npt.ArrayLike, rng: np.random.Generator) -> Floats | None:
+    def simulate(
+        self,
+        params: npt.ArrayLike,
+        rng: np.random.Generator,
+        fluxes: Floats | None = None,
+    ) -> Floats | None:
         """Draw a frame given the parameters; see `FrameLikelihood.simulate`."""
-        return self.likelihood.simulate(self._vector(params), rng)
+        return self.likelihood.simulate(self._vector(params), rng, fluxes)
 
     def expected_counts(self, params: npt.ArrayLike) -> Floats:
         """Expected counts of every pixel, free fluxes at their most likely values.

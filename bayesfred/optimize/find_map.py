@@ -14,7 +14,7 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.newton import NewtonResult, maximize
-from bayesfred.optimize.outliers import Kept, keep_all, reject
+from bayesfred.optimize.outliers import BREAKDOWN, Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
 
 # The maximum is found where a Newton step from it would move no parameter by more than this share
@@ -24,6 +24,11 @@ CLOSENESS = 1e-3
 NO_DENSITY = (
     "start: the posterior has no density there, expected parameters within the prior whose map "
     "does not fold"
+)
+
+MOSTLY_REJECTED = (
+    "but over 40 % of the sources in the frame were rejected, so that what remains may fit with "
+    "wrong parameters: check the catalogue, or narrow the priors"
 )
 
 
@@ -154,7 +159,7 @@ def _search(
             if again.distance < CLOSENESS:
                 break
         assert top is not None, "a first start"
-        return found.posterior, _judged(posterior, found.posterior, top, evaluations, path)
+        return found.posterior, _judged(posterior, found, top, evaluations, path)
 
 
 def _require_determined(posterior: Posterior, params: Floats, fisher: Floats) -> None:
@@ -177,15 +182,18 @@ def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Ite
 
 
 def _judged(
-    given: Posterior, posterior: Posterior, top: NewtonResult, evaluations: int, path: str
+    given: Posterior, kept: Kept, top: NewtonResult, evaluations: int, path: str
 ) -> MapEstimate:
     """The maximum of what is kept of the given posterior, and whether the model fits there."""
+    posterior = kept.posterior
     light, sources = source_light(posterior, top.params), len(posterior.model.sources)
     how = f"{path and f' from {path}'}, {light.matched.sum()} of {sources} sources matched"
     fit, rejecting = fit_statistics(posterior, top.params), posterior is not given
     if rejecting:
         pixels = given.mask.sum() - posterior.mask.sum()
         how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
+    if kept.share > BREAKDOWN:
+        return _estimate(posterior, top, evaluations, how, (False, MOSTLY_REJECTED))
     enough = enough_matched(posterior, light)
     fits = consistent(fit) and enough
     return _estimate(posterior, top, evaluations, how, (fits, _advice(fit, enough, rejecting)))

@@ -15,7 +15,7 @@ from bayesfred.analysis.comparison import Comparison
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.photons import rounded
-from bayesfred.analysis.sbc import PosteriorCalibration
+from bayesfred.analysis.sbc import SBCResult
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import printable
 from bayesfred.reporting.labels import scale_of, with_error
@@ -86,12 +86,12 @@ def parameter_table(summary: Any, width: int) -> Table:
     return _table([column for column in columns if any(column.cells)], width)
 
 
-def study_table(result: NoiseStudy | PosteriorCalibration, width: int) -> Table:
+def study_table(result: NoiseStudy | SBCResult, width: int) -> Table:
     """Lay out a study's findings: a row for each noise level, or for each quantity.
 
     Parameters
     ----------
-    result : NoiseStudy or PosteriorCalibration
+    result : NoiseStudy or SBCResult
     width : int
         Characters in a line. Where they do not suffice, columns are left out: lambda first, then
         chi2, the coverage of 68 %, pull and efficiency.

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from bayesfred._typing import Floats
 from bayesfred.analysis.ecdf_bands import band, ecdf, points
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
-from bayesfred.analysis.sbc import PosteriorCalibration
+from bayesfred.analysis.sbc import SBCResult
 from bayesfred.analysis.study_helpers import LEVELS
 from bayesfred.model.parameters import Parameter
 from bayesfred.reporting.labels import axis_label, math_symbol
@@ -188,12 +188,12 @@ def _noise_handles(series: Sequence[str]) -> list[Line2D]:
     ]
 
 
-def calibration_plot(calibration: PosteriorCalibration, parameters: Sequence[Parameter]) -> Figure:
+def calibration_plot(calibration: SBCResult, parameters: Sequence[Parameter]) -> Figure:
     """Every quantity's ranks less the uniform distribution with its 95 % band, coverage, and pulls.
 
     Parameters
     ----------
-    calibration : PosteriorCalibration
+    calibration : SBCResult
     parameters : sequence of Parameter
         Those of the posterior, for their symbols.
 
@@ -280,5 +280,6 @@ def _pulls(ax: Axes, position: Floats, pulls: Floats, error: float) -> None:
 
 
 def _quantity(name: str) -> str:
-    """What else a calibration ranks: the log-likelihood, or f or g at a point of the field."""
-    return re.sub(r"^([fg])\((.*)\)$", r"$\1$(\2) px", name).replace("_", " ")
+    """What else a calibration ranks: log-likelihood, displacement at a point, a source's flux."""
+    name = re.sub(r"^displacement_([xy])(\(.*\))$", r"displacement $\1$\2 px", name)
+    return re.sub(r"^flux\((.*)\)$", r"flux of source \1", name).replace("_", " ")
