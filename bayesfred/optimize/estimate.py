@@ -6,6 +6,7 @@ import numpy as np
 from scipy import linalg
 
 from bayesfred._typing import Floats, Ints
+from bayesfred.errors import InputError
 from bayesfred.io.serialize import serializable
 
 
@@ -31,6 +32,12 @@ class Modes:
     covariances: Floats
     weights: Floats
     count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= len(self.weights) or not np.all(self.weights > 0.0):
+            raise InputError(
+                "modes: got none or without weight, expected one or more: see find_map"
+            )
 
     def assign(self, params: Floats) -> Ints:
         """The component that each parameter vector, shape (n, d), most likely belongs to."""

@@ -232,14 +232,10 @@ class _Surroundings:
         wide = np.zeros_like(self.top.covariance)
         wide[np.ix_(self.columns, self.columns)] = covariance
         wide[np.ix_(rest, rest)] = inverse(information)
-        return _Draws(
-            params[order], log_mass[order], self._with(mean[None])[0], wide, self.columns
-        )
+        return _Draws(params[order], log_mass[order], self._with(mean[None])[0], wide, self.columns)
 
 
-def _mixture(
-    posterior: Posterior, found: list[NewtonResult], draws: _Draws | None
-) -> Modes | None:
+def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | None) -> Modes | None:
     """The modes with any mass, and what there is between them; None where one mode is all."""
     low, high = posterior.support
     log_mass = []

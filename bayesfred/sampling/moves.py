@@ -163,7 +163,9 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         return cls(means, covariances, weights, posterior.support, heavy_share=heavy_share)
 
     @classmethod
-    def fitted(cls, posterior: TargetDensity, estimate: MapEstimate, draws: Floats) -> "LaplaceMove":
+    def fitted(
+        cls, posterior: TargetDensity, estimate: MapEstimate, draws: Floats
+    ) -> "LaplaceMove":
         """The move with the mean and covariance of draws, shape (n, d), of every mode its own.
 
         A mode of fewer draws than parameters keeps those of its Laplace approximation.
