@@ -62,7 +62,8 @@ def run_record(result: Result) -> dict[str, Any]:
     -------
     dict
         `sampled_well` (None where nothing was sampled), `fits_data`, `trustworthy` and `message`
-        of the verdict; `causes`, a dict for each; `displacement`, the sentence; `parameters`, a
+        of the verdict; `modes`, the draws' shares in the posterior's modes if there are several;
+        `causes`, a dict for each; `displacement`, the sentence; `parameters`, a
         dict for each row of the summary, by its columns; `files`, the paths of `chain`, `report`,
         `picture` and `sources`.
     """

@@ -32,6 +32,7 @@ from bayesfred.analysis.verdict import (
     judge_approximation,
     judge_fit,
     judge_sampling,
+    mode_shares,
 )
 from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.posterior import Posterior
@@ -51,8 +52,9 @@ class Diagnostics:
     Attributes
     ----------
     sampled_well : bool or None
-        Whether R-hat, effective sample sizes and acceptance are as they should be, and the MAP is
-        at the maximum. It says nothing of the model. None where nothing was sampled: the draws are
+        Whether R-hat, effective sample sizes and acceptance are as they should be, the MAP is at
+        the maximum, and enough sources are matched for the search to have found them. It says
+        nothing else of the model. None where nothing was sampled: the draws are
         those of the Laplace approximation, and what is said of sampling below is nan.
     fits_data : bool
         Whether deviance and Pearson's statistic are what the noise makes them, within 5 standard
@@ -62,6 +64,8 @@ class Diagnostics:
         error bars leave out.
     causes : tuple of Cause
         Why the model does not fit, the most likely cause first; empty where it fits.
+    modes : tuple of float
+        The shares of the draws that lie in the posterior's modes, largest first.
     rhat : dict of str to float
         Rank-normalised split R-hat between ensembles, by parameter.
     ess_bulk, ess_tail : dict of str to float
@@ -114,6 +118,7 @@ class Diagnostics:
     fits_data: bool
     sentences: tuple[str, str, str]
     causes: tuple[Cause, ...]
+    modes: tuple[float, ...]
     rhat: dict[str, float]
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
@@ -162,12 +167,14 @@ class Diagnostics:
 
     @property
     def verdict(self) -> dict[str, Any]:
-        """What every output says of the run: three flags and the message."""
+        """What every output says of the run: flags, message and, of several, the modes' shares."""
+        several = {"modes": list(self.modes)} if len(self.modes) > 1 else {}
         return {
             "sampled_well": self.sampled_well,
             "fits_data": self.fits_data,
             "trustworthy": self.trustworthy,
             "message": self.message,
+            **several,
         }
 
     def summary(self, chain: Chain, *, truth: Floats | None = None) -> Table:
@@ -234,6 +241,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape
+    fit = fit_statistics(posterior, chain.estimate.params)
+    fitted = judge_fit(posterior, chain.estimate, fit)
     rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
     acceptance = efficiency = np.nan
     sampled_well = None
@@ -243,13 +252,11 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         tau = np.array([autocorrelation_time(series) for series in walkers])
         acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
         sampled_well, sampling = judge_sampling(
-            chain, rhat, np.minimum(bulk, tail), acceptance, target_ess
+            chain, rhat, np.minimum(bulk, tail), acceptance, target_ess, fitted.unmatched
         )
     else:
         efficiency = importance_efficiency(chain)
         sampling = judge_approximation(chain, efficiency)
-    fit = fit_statistics(posterior, chain.estimate.params)
-    fitted = judge_fit(posterior, chain.estimate, fit)
     residuals, checks = None, sums(fit)
     if isinstance(posterior, Posterior):
         residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
@@ -264,6 +271,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         fits_data=fitted.fits_data,
         sentences=(fitted.sentence, sampling, fitted.omitted),
         causes=fitted.causes,
+        modes=mode_shares(chain),
         rhat=_by_name(names, rhat),
         ess_bulk=_by_name(names, bulk),
         ess_tail=_by_name(names, tail),

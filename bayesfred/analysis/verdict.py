@@ -19,11 +19,19 @@ from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.sampling.chain import Chain
 
-__all__ = ["MIN_EFFICIENCY", "FitVerdict", "judge_approximation", "judge_fit", "judge_sampling"]
+__all__ = [
+    "MIN_EFFICIENCY",
+    "FitVerdict",
+    "judge_approximation",
+    "judge_fit",
+    "judge_sampling",
+    "mode_shares",
+]
 
 MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
 MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
+LEAST_MODE = 0.01  # share of the draws from which a mode is told of
 WIDER = 1.1  # factor of the errors from which it is said
 
 
@@ -40,12 +48,15 @@ class FitVerdict:
         How well it fits, or how badly, probably why and what to do.
     omitted : str
         What the error bars leave out.
+    unmatched : str
+        How many sources are matched, where too few are; empty elsewhere.
     """
 
     fits_data: bool
     causes: tuple[Cause, ...]
     sentence: str
     omitted: str
+    unmatched: str
 
 
 def judge_fit(posterior: Any, estimate: MapEstimate, fit: Mapping[str, float]) -> FitVerdict:
@@ -67,13 +78,17 @@ def judge_fit(posterior: Any, estimate: MapEstimate, fit: Mapping[str, float]) -
     -------
     FitVerdict
     """
-    params, causes, matched = estimate.params, tuple[Cause, ...](), ""
-    fits = consistent(fit)
+    fits, causes, matched, unmatched = consistent(fit), tuple[Cause, ...](), "", ""
+    params = estimate.params
     if isinstance(posterior, Posterior):
         light = source_light(posterior, params)
         enough = enough_matched(posterior, light)
         matched = f", {light.matched.sum()} of {len(light.matched)} sources matched"
-        fits = fits and enough
+        if not enough:
+            fits, unmatched = (
+                False,
+                f"{light.matched.sum()} of {len(light.matched)} sources matched",
+            )
         if not fits:
             causes = find_causes(posterior, params)
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
@@ -84,13 +99,21 @@ def judge_fit(posterior: Any, estimate: MapEstimate, fit: Mapping[str, float]) -
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
-    return FitVerdict(fits, causes, sentence, _omitted(posterior, fit, fits))
+    return FitVerdict(fits, causes, sentence, _omitted(posterior, fit, fits), unmatched)
 
 
 def judge_sampling(
-    chain: Chain, rhat: Floats, ess: Floats, acceptance: float, target_ess: float
+    chain: Chain,
+    rhat: Floats,
+    ess: Floats,
+    acceptance: float,
+    target_ess: float,
+    unmatched: str,
 ) -> tuple[bool, str]:
     """Judge how a chain is sampled.
+
+    Where too few sources are matched the search may have missed the sources altogether, and no
+    agreement of the draws can tell.
 
     Parameters
     ----------
@@ -99,6 +122,8 @@ def judge_sampling(
         Of every parameter; the smaller of its two effective sample sizes.
     acceptance : float
     target_ess : float
+    unmatched : str
+        See `FitVerdict`.
 
     Returns
     -------
@@ -118,11 +143,13 @@ def judge_sampling(
     if not acceptance >= MIN_ACCEPTANCE:
         failures.append(f"acceptance {acceptance:.1%} is below {MIN_ACCEPTANCE:.0%}")
     failures += _not_at_maximum(chain)
+    if unmatched:
+        failures.append(f"{unmatched}, so that other modes may have been missed")
     if failures:
-        return False, f"Not sampled well: {'; '.join(failures)}."
+        return False, f"Not sampled well: {'; '.join(failures)}.{_several(chain)}"
     return True, (
         f"Sampled well: R-hat at most {rhat.max():.4f}, effective sample size at least "
-        f"{ess.min():.0f}, acceptance {acceptance:.1%}."
+        f"{ess.min():.0f}, acceptance {acceptance:.1%}.{_several(chain)}"
     )
 
 
@@ -147,10 +174,35 @@ def judge_approximation(chain: Chain, efficiency: float) -> str:
         )
     if failures:
         wrong = "; ".join(failures)
-        return f"Not sampled, and errors of the Laplace approximation do not hold: {wrong}."
+        return (
+            f"Not sampled, and errors of the Laplace approximation do not hold: {wrong}."
+            f"{_several(chain)}"
+        )
     return (
         "Not sampled: errors are those of the information at the maximum (importance efficiency "
-        f"{efficiency:.0%})."
+        f"{efficiency:.0%}).{_several(chain)}"
+    )
+
+
+def mode_shares(chain: Chain) -> tuple[float, ...]:
+    """The shares of the draws that lie in the posterior's modes, largest first.
+
+    Modes with less than a hundredth of the draws are left out; so are draws between modes.
+    """
+    modes, draws = chain.estimate.mixture, chain.draws()
+    shares = np.bincount(modes.assign(draws), minlength=modes.count)[: modes.count] / len(draws)
+    return tuple(sorted((float(share) for share in shares if share >= LEAST_MODE), reverse=True))
+
+
+def _several(chain: Chain) -> str:
+    """What is said of several modes."""
+    shares = mode_shares(chain)
+    if len(shares) < 2:
+        return ""
+    largest = " and ".join(f"{share:.0%}" for share in shares[:2])
+    return (
+        f" The posterior has {len(shares)} modes, the largest with {largest} of the draws: mean "
+        "and standard deviation describe none of them."
     )
 
 

@@ -21,8 +21,9 @@ from h5py import h5a, h5d, h5l, h5o, h5t, h5z
 from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
-SCHEMA = 4
-READABLE = (3, 4)  # schema 3 means the shifted Poisson by read noise; see `sampling/chainfile`
+SCHEMA = 5
+# schema 3 means the shifted Poisson by read noise, see `sampling/chainfile`; 3 and 4 have one mode
+READABLE = (3, 4, 5)
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 

@@ -1,6 +1,7 @@
 """The posterior's maximum: `starts` says where to begin, `newton` maximises, here it is judged."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -13,6 +14,7 @@ from bayesfred.optimize.determined import undetermined
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
+from bayesfred.optimize.modes import ModeSearch, find_modes
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import BREAKDOWN, Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
@@ -159,7 +161,9 @@ def _search(
             if again.distance < CLOSENESS:
                 break
         assert top is not None, "a first start"
-        return found.posterior, _judged(posterior, found, top, evaluations, path)
+        search = find_modes(found.posterior, top)
+        evaluations += search.evaluations
+        return found.posterior, _judged(posterior, found, search, evaluations, path)
 
 
 def _require_determined(posterior: Posterior, params: Floats, fisher: Floats) -> None:
@@ -182,21 +186,25 @@ def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Ite
 
 
 def _judged(
-    given: Posterior, kept: Kept, top: NewtonResult, evaluations: int, path: str
+    given: Posterior, kept: Kept, search: ModeSearch, evaluations: int, path: str
 ) -> MapEstimate:
     """The maximum of what is kept of the given posterior, and whether the model fits there."""
-    posterior = kept.posterior
+    posterior, top = kept.posterior, search.top
     light, sources = source_light(posterior, top.params), len(posterior.model.sources)
     how = f"{path and f' from {path}'}, {light.matched.sum()} of {sources} sources matched"
     fit, rejecting = fit_statistics(posterior, top.params), posterior is not given
     if rejecting:
         pixels = given.mask.sum() - posterior.mask.sum()
         how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
-    if kept.share > BREAKDOWN:
-        return _estimate(posterior, top, evaluations, how, (False, MOSTLY_REJECTED))
+    if search.modes is not None and search.modes.count > 1:
+        first, second = search.modes.weights[:2]
+        how += f", {search.modes.count} modes, the largest with {first:.0%} and {second:.0%}"
     enough = enough_matched(posterior, light)
-    fits = consistent(fit) and enough
-    return _estimate(posterior, top, evaluations, how, (fits, _advice(fit, enough, rejecting)))
+    judged = consistent(fit) and enough, _advice(fit, enough, rejecting)
+    if kept.share > BREAKDOWN:
+        judged = False, MOSTLY_REJECTED
+    estimate = _estimate(posterior, top, evaluations, how, judged)
+    return replace(estimate, modes=search.modes)
 
 
 def _estimate(

@@ -1,8 +1,8 @@
 """The chain file: one HDF5 file a run, with everything needed to judge, replay and resume it.
 
 Groups `ensemble_0`, ... are in emcee's own layout. Beside them stand the posterior itself (frame,
-mask, model, noise, nuisances, priors), the MAP, the seed, the versions of what made it and, where
-there is one, the record of the run: title, frame, settings, notes and truth. A
+mask, model, noise, nuisances, priors), the MAP and other modes, the seed, the versions of what made
+it and, where there is one, the record of the run: title, frame, settings, notes and truth. A
 checkpoint writes a whole new file from memory and renames it over the old one, so that a reader
 finds either the old state or the new one. `io.hdf5_checks` says what a file must be before it is
 read, and `io.serialize` stores the objects in it.
@@ -10,6 +10,7 @@ read, and `io.serialize` stores the objects in it.
 
 import hashlib
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -18,12 +19,12 @@ import numpy as np
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
-from bayesfred.io.atomic import replace
+from bayesfred.io import atomic
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
 from bayesfred.io.serialize import read, write, write_array
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
-from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.sampling.chain import Chain, Method
 from bayesfred.sampling.record import RunRecord
 
@@ -111,13 +112,15 @@ def write_chain(chain: Chain) -> None:
         )
         write(file.create_group("posterior"), chain.density)
         write(file.create_group("estimate"), chain.estimate)
+        if chain.estimate.modes is not None:
+            write(file.create_group("modes"), chain.estimate.modes)
         if chain.record is not None:
             write(file.create_group("record"), chain.record)
         for k, state in enumerate(chain.random_states):
             _write_ensemble(file.create_group(f"ensemble_{k}"), chain, k, state)
     with content.getbuffer() as written:
         try:
-            replace(chain.path, written, seal(written), sole_writer=True)
+            atomic.replace(chain.path, written, seal(written), sole_writer=True)
         except InputError as error:
             raise InputError(
                 f"{error}: what was saved before is still there: resume from it"
@@ -146,7 +149,7 @@ def _refuse_shifted_poisson(file: h5py.File) -> None:
     """
     noise = file["posterior/noise"].attrs
     shifted = noise["kind"] == b"noise.poisson" and noise.get("read_noise", 0.0) > 0.0
-    if shifted and file.attrs["schema"] < SCHEMA:
+    if shifted and file.attrs["schema"] < 4:
         raise InputError(
             f"noise: got read noise {noise['read_noise']:g} as the shifted Poisson distribution "
             f"(schema {file.attrs['schema']}), expected the convolution with a Gaussian that has "
@@ -156,6 +159,7 @@ def _refuse_shifted_poisson(file: h5py.File) -> None:
 
 def _read(path: Path, file: h5py.File) -> Chain:
     _refuse_shifted_poisson(file)
+    modes = read(file["modes"], Modes) if "modes" in file else None
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     chain = Chain(
         path=path,
@@ -166,7 +170,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
         random_states=tuple(_random_state(g.attrs) for g in groups),
         burn_in=int(file.attrs["burn_in"]),
         seed=int(file.attrs["seed"]),
-        estimate=read(file["estimate"], MapEstimate),
+        estimate=replace(read(file["estimate"], MapEstimate), modes=modes),
         versions={name: version.decode() for name, version in file["versions"].attrs.items()},
         target_ess=float(file.attrs["target_ess"]),
         n_invalid=int(file.attrs["n_invalid"]),
@@ -186,6 +190,10 @@ def _read(path: Path, file: h5py.File) -> Chain:
     }
     if chain.record is not None and chain.record.truth is not None:
         expected["truth"] = chain.record.truth, (d,)
+    if modes is not None:
+        k = len(modes.weights)
+        expected["modes"] = modes.means, (k, d)
+        expected["their covariances"] = modes.covariances, (k, d, d)
     wrong = [name for name, (array, right) in expected.items() if array.shape != right]
     if wrong or 0 in shape:
         raise ValueError(f"shapes that do not agree: {', '.join(wrong)}")

@@ -12,8 +12,10 @@ References
 C. Andrieu & J. Thoms (2008), Statistics and Computing 18, 343 (adaptation that ends).
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import emcee
@@ -84,15 +86,24 @@ def begin(
 ) -> Step:
     """Walkers at draws of the Laplace approximation that the prior admits.
 
+    Every ensemble starts in one mode, different ones in different modes: R-hat shows whether they
+    have reached each other's.
+
     Raises
     ------
     InputError
         If there is no density around the estimate.
     """
-    move = LaplaceMove.of(posterior, estimate)
+    modes = estimate.mixture
+    moves = [
+        LaplaceMove.of(posterior, replace(estimate, params=mean, covariance=covariance, modes=None))
+        for mean, covariance in zip(modes.means, modes.covariances, strict=True)
+    ][: modes.count]
     log_prob_of = _LogProb(posterior, 0)
     states = []
-    for child in np.random.SeedSequence(seed).spawn(ensembles):
+    for child, move in zip(
+        np.random.SeedSequence(seed).spawn(ensembles), itertools.cycle(moves), strict=False
+    ):
         random = np.random.RandomState(np.random.MT19937(child))
         coords, log_prob = np.empty((0, len(posterior.parameter_names))), np.empty(0)
         for _ in range(100):
@@ -200,9 +211,7 @@ def moves_after(
         draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
         share = DE_SHARE_ADAPTED
         with suppress(InputError):  # of too few draws: the next look has more
-            move = LaplaceMove(
-                draws.mean(axis=0), np.cov(draws.T, ddof=0), support=posterior.support
-            )
+            move = LaplaceMove.fitted(posterior, estimate, draws)
     return [(move, 1.0 - share), (emcee.moves.DEMove(live_dangerously=True), share)]
 
 

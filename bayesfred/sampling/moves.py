@@ -130,6 +130,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         posterior there times the root of the determinant of the covariance, in which the variance
         of tau is the squared distance between the tau_k; a quarter of it without a heavy share.
 
+        Of a posterior of several modes each mode has such approximations, with its weight.
+
         Raises
         ------
         InputError
@@ -139,48 +141,49 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         ----------
         H. Rue, S. Martino & N. Chopin (2009), JRSS B 71, 319, Section 3.
         """
-        if not posterior.hyperparameters:
-            mean = estimate.params
-            low, high = posterior.support
-            if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
-                mean = mean + estimate.covariance @ posterior.gradient(mean)
-            return cls(
-                mean, estimate.covariance, support=posterior.support, heavy_share=heavy_share
-            )
         if len(posterior.hyperparameters) > 1:
             raise InputError(
                 f"posterior: got the hyperparameters {', '.join(posterior.hyperparameters)}, "
                 "expected at most one: proposals are nested on a single one"
             )
-        j = posterior.parameter_names.index(posterior.hyperparameters[0])
-        rest = np.arange(estimate.params.size) != j
-        ratio = 0.5 * np.sqrt(estimate.covariance[j, j]) / estimate.params[j]
-        # a proposal may be too wide in tau; without its heavy share it stands for the posterior
-        width = 1.0 if heavy_share else 0.5
-        means, covariances = [], []
-        logs: list[float] = []
-        for outward in (range(NESTED), range(-1, -NESTED, -1)):
-            for k in outward:
-                mean, covariance = estimate.params.copy(), np.zeros(estimate.covariance.shape)
-                mean[j] *= np.exp(k * ratio)
-                covariance[np.ix_(rest, rest)] = inverse(
-                    posterior.information(mean)[np.ix_(rest, rest)]
-                )
-                mean += covariance @ posterior.gradient(mean)
-                covariance[j, j] = (ratio * mean[j] * width) ** 2
-                log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(covariance)[1]
-                if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
-                    break
-                means.append(mean)
-                covariances.append(covariance)
-                logs.append(log)
-        return cls(
-            np.array(means),
-            np.array(covariances),
-            np.exp(np.array(logs) - logsumexp(logs)),
-            posterior.support,
-            heavy_share=heavy_share,
-        )
+        modes, parts = estimate.mixture, []
+        for k, weight in enumerate(modes.weights):
+            mean, covariance = modes.means[k], modes.covariances[k]
+            if posterior.hyperparameters and k < modes.count:
+                # too wide in tau is harmless; without a heavy share it stands for the posterior
+                width = 1.0 if heavy_share else 0.5
+                means, covariances, weights = _nested(posterior, mean, covariance, width)
+            else:
+                low, high = posterior.support
+                if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
+                    mean = mean + covariance @ posterior.gradient(mean)
+                means, covariances, weights = mean[None], covariance[None], np.ones(1)
+            parts.append((means, covariances, weight * weights))
+        means, covariances, weights = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return cls(means, covariances, weights, posterior.support, heavy_share=heavy_share)
+
+    @classmethod
+    def fitted(
+        cls, posterior: TargetDensity, estimate: MapEstimate, draws: Floats
+    ) -> "LaplaceMove":
+        """The move with the mean and covariance of draws, shape (n, d), of every mode its own.
+
+        A mode of fewer draws than parameters keeps those of its Laplace approximation.
+
+        Raises
+        ------
+        InputError
+            If the draws spread in too few directions.
+        """
+        modes, d = estimate.mixture, draws.shape[1]
+        means, covariances = modes.means.copy(), modes.covariances.copy()
+        own, number = modes.assign(draws), np.ones(len(means))
+        for k in range(len(means)):
+            some = draws[own == k]
+            if len(some) > 2 * d or len(means) == 1:
+                means[k], covariances[k] = some.mean(axis=0), np.cov(some.T, ddof=0)
+            number[k] += len(some)
+        return cls(means, covariances, number / number.sum(), posterior.support)
 
     def draw(self, n: int, random: np.random.RandomState) -> Floats:
         """n draws from the proposal, shape (n, d)."""
@@ -233,3 +236,31 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         new = self.draw(len(s), random)
         before, after = np.split(self.log_density(np.concatenate([s, new])), 2)
         return new, before - after
+
+
+def _nested(
+    posterior: TargetDensity, params: Floats, covariance: Floats, width: float
+) -> tuple[Floats, Floats, Floats]:
+    """Means, covariances and weights of approximations nested on the hyperparameter.
+
+    See `LaplaceMove.of`; `width` times the distance between its values is its standard deviation.
+    """
+    j = posterior.parameter_names.index(posterior.hyperparameters[0])
+    rest = np.arange(params.size) != j
+    ratio = 0.5 * np.sqrt(covariance[j, j]) / params[j]
+    means, covariances = [], []
+    logs: list[float] = []
+    for outward in (range(NESTED), range(-1, -NESTED, -1)):
+        for k in outward:
+            mean, given = params.copy(), np.zeros(covariance.shape)
+            mean[j] *= np.exp(k * ratio)
+            given[np.ix_(rest, rest)] = inverse(posterior.information(mean)[np.ix_(rest, rest)])
+            mean += given @ posterior.gradient(mean)
+            given[j, j] = (ratio * mean[j] * width) ** 2
+            log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(given)[1]
+            if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
+                break
+            means.append(mean)
+            covariances.append(given)
+            logs.append(log)
+    return np.array(means), np.array(covariances), np.exp(np.array(logs) - logsumexp(logs))
