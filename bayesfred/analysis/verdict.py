@@ -85,10 +85,7 @@ def judge_fit(posterior: Any, estimate: MapEstimate, fit: Mapping[str, float]) -
         enough = enough_matched(posterior, light)
         matched = f", {light.matched.sum()} of {len(light.matched)} sources matched"
         if not enough:
-            fits, unmatched = (
-                False,
-                f"{light.matched.sum()} of {len(light.matched)} sources matched",
-            )
+            fits, unmatched = False, matched.removeprefix(", ")
         if not fits:
             causes = find_causes(posterior, params)
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
@@ -189,7 +186,10 @@ def mode_shares(chain: Chain) -> tuple[float, ...]:
 
     Modes with less than a hundredth of the draws are left out; so are draws between modes.
     """
-    modes, draws = chain.estimate.mixture, chain.draws()
+    modes = chain.estimate.modes
+    if modes is None:
+        return (1.0,)
+    draws = chain.draws()
     shares = np.bincount(modes.assign(draws), minlength=modes.count)[: modes.count] / len(draws)
     return tuple(sorted((float(share) for share in shares if share >= LEAST_MODE), reverse=True))
 
