@@ -136,7 +136,7 @@ class _Draws(NamedTuple):
         for mode in modes:
             step = (self.params - mode.params)[:, self.columns]
             block = mode.covariance[np.ix_(self.columns, self.columns)]
-            squared = np.einsum("nk,kn->n", step, linalg.solve(block, step.T, assume_a="pos"))
+            squared = np.einsum("nk,kl,nl->n", step, inverse(block), step)
             outside &= squared > k + 3.0 * np.sqrt(2.0 * k)  # a chi-square's expectation and sd
         if not outside.any():
             return 0.0, self.mean, self.covariance
