@@ -43,7 +43,8 @@ DRAWS = 1024
 MOST = 24  # searches from aliases, and from draws
 MOST_ALIASES = 64  # sources that are tried in one place
 BESIDE = 0.5  # PSF widths between a source and the one whose place it takes, at most
-LEAST_SHARE = 0.2  # of proposals between the modes, for what lies there is less likely but wide
+LEAST_SHARE = 0.1  # of proposals between the modes
+WIDE = 0.1  # ... and of those that reach wherever the bright sources or the prior allow
 CLOSE = 1e-2  # standard deviations from a maximum
 TURNS = tuple(
     np.array([[c, -s], [s, c]]) @ np.diag([1.0, mirror])
@@ -124,16 +125,28 @@ class _Draws(NamedTuple):
     covariance: Floats  # (d, d)
     columns: Ints  # of the parameters in which they differ
 
-    def share(self, modes: Sequence[NewtonResult], log_mass: float) -> float:
-        """The share of the mass that is in no mode; the modes have `log_mass` together."""
-        between, k = np.ones(len(self.params), bool), self.columns.size
+    def between(
+        self, modes: Sequence[NewtonResult], log_mass: float
+    ) -> tuple[float, Floats, Floats]:
+        """Share of the mass that is in no mode, its mean and its covariance.
+
+        The modes have `log_mass` together.
+        """
+        outside, k = np.ones(len(self.params), bool), self.columns.size
         for mode in modes:
             step = (self.params - mode.params)[:, self.columns]
             block = mode.covariance[np.ix_(self.columns, self.columns)]
-            squared = np.einsum("nk,kn->n", step, linalg.solve(block, step.T, assume_a="pos"))
-            between &= squared > k + 3.0 * np.sqrt(2.0 * k)  # a chi-square's expectation and sd
-        rest = float(logsumexp(self.log_mass[between])) if between.any() else -np.inf
-        return float(np.exp(rest - np.logaddexp(rest, log_mass)))
+            squared = np.einsum("nk,kl,nl->n", step, inverse(block), step)
+            outside &= squared > k + 3.0 * np.sqrt(2.0 * k)  # a chi-square's expectation and sd
+        if not outside.any():
+            return 0.0, self.mean, self.covariance
+        total = float(logsumexp(self.log_mass[outside]))
+        weights = np.exp(self.log_mass[outside] - total)
+        mean = weights @ self.params[outside]
+        step = self.params[outside] - mean
+        # few draws may weigh most; each stands for as much around it as a mode
+        covariance = (step.T * weights) @ step + modes[0].covariance
+        return float(np.exp(total - np.logaddexp(total, log_mass))), mean, covariance
 
 
 class _Surroundings:
@@ -210,11 +223,13 @@ class _Surroundings:
         normal = np.random.default_rng(0).standard_normal((DRAWS, mean.size))
         z = mean + normal @ lower.T
         design, worth = field.design(inside, self.position[inside]), self.worth[inside]
-        possible = np.zeros(DRAWS, bool)
+        possible = np.zeros(len(z), bool)
         for k, moved in enumerate(z - self.top.params[self.columns]):
             distance = np.hypot(*(design @ moved))
             loss = self._lost(distance) @ worth
             possible[k] = loss < HOPELESS and distance.max() > SAME * self.sigma
+        if not possible.any():
+            return None
         params = self._with(z[possible])
         log_prob = self.posterior.log_prob(params)
         log_density = (
@@ -248,11 +263,12 @@ def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | No
     means, covariances = [found[k].params for k in order], [found[k].covariance for k in order]
     weights = weights[order] / weights[order].sum()
     if draws is not None:
-        share = draws.share([found[k] for k in order], float(logsumexp(log_mass)))
+        share, mean, covariance = draws.between([found[k] for k in order], logsumexp(log_mass))
         if share > NEGLIGIBLE:
-            share = max(share, LEAST_SHARE)
-            means, covariances = [*means, draws.mean], [*covariances, draws.covariance]
-            weights = np.append((1.0 - share) * weights, share)
+            share = np.clip(share, LEAST_SHARE, 1.0 - LEAST_SHARE - WIDE)
+            means = [*means, mean, draws.mean]
+            covariances = [*covariances, covariance, draws.covariance]
+            weights = np.concatenate([(1.0 - share - WIDE) * weights, [share, WIDE]])
     if len(means) == 1:
         return None
     return Modes(np.array(means), np.array(covariances), weights, len(order))
