@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.analysis.causes import Cause, find_causes
-from bayesfred.model.posterior import Posterior
+from bayesfred.analysis.causes import Cause, find_causes, hidden_causes
+from bayesfred.analysis.residuals import Residuals
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.sampling.chain import Chain
@@ -47,35 +47,46 @@ class FitVerdict:
     omitted: str
 
 
-def judge_fit(posterior: Any, params: Floats, fit: Mapping[str, float]) -> FitVerdict:
+def judge_fit(
+    posterior: Any, params: Floats, fit: Mapping[str, float], residuals: Residuals | None
+) -> FitVerdict:
     """Judge whether a model fits the counts at its maximum.
 
     It does where deviance and Pearson's statistic are within 5 standard deviations of their
-    expectations, and enough sources are matched, see `bayesfred.optimize.matched`.
+    expectations, enough sources are matched (see `bayesfred.optimize.matched`), and neither a score
+    test nor a source fails. Of true models at most 1 % fail, all tests together.
 
     Parameters
     ----------
     posterior : Posterior
-        Of another density with counts only the sums are judged.
     params : ndarray, shape (d,)
     fit : mapping of str to float
         See `fit_statistics`.
+    residuals : Residuals or None
+        See `judge_residuals`. None for another density with counts: only the sums are judged.
 
     Returns
     -------
     FitVerdict
     """
-    fits, causes, matched = consistent(fit), tuple[Cause, ...](), ""
-    if isinstance(posterior, Posterior):
+    consist, failures, causes, matched = consistent(fit), "", tuple[Cause, ...](), ""
+    if residuals is not None:
         light = source_light(posterior, params)
-        enough = enough_matched(posterior, light)
         matched = f", {light.matched.sum()} of {len(light.matched)} sources matched"
-        fits = fits and enough
-        if not fits:
+        consist = consist and enough_matched(posterior, light)
+        failures = _failures(residuals)
+        if not consist:
             causes = find_causes(posterior, params)
+        causes = causes or hidden_causes(posterior, residuals.scores, residuals.tests)
+    fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
     if fits:
         sentence = f"The model fits the counts: {sums} expectation{matched}."
+    elif consist:
+        sentence = (
+            f"The model does not fit the counts: {failures}, where sums over all pixels do not "
+            f"show it ({sums} expectation{matched}). {_why(causes)}"
+        )
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
@@ -160,6 +171,22 @@ def _sum(fit: Mapping[str, float], name: str) -> str:
     side = "below" if excess < 0.0 else "above"
     head = "deviance" if name == "deviance" else "Pearson's statistic"
     return f"{head} {abs(excess):.1f} standard deviations {side}"
+
+
+def _failures(residuals: Residuals) -> str:
+    """The score tests and the sources that fail, in words."""
+    scores, tests = residuals.scores, residuals.tests
+    parts = [
+        f"{lead.name} is {abs(lead.z):.0f} standard deviations from zero score"
+        for lead in scores.leading[:1]
+    ]
+    if tests.failed.any():
+        parts.append(f"{tests.failed.sum()} of {tests.failed.size} sources do not fit")
+    parts += [
+        f"the sources' {spread.name} scatter by {spread.z:.0f} standard deviations too much"
+        for spread in tests.failed_spreads
+    ]
+    return ", ".join(parts)
 
 
 def _why(causes: tuple[Cause, ...]) -> str:
