@@ -190,7 +190,8 @@ class Diagnostics:
         Returns
         -------
         astropy.table.Table
-            See `bayesfred.sampling.summary.summary`.
+            See `bayesfred.sampling.summary.summary`. Where the model does not fit there is a column
+            `robust_sd` besides, see `bayesfred.analysis.robust`.
         """
         table = summary(chain, truth=truth, columns=self.columns)
         table.meta.update(self.verdict)

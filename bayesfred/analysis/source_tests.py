@@ -59,6 +59,7 @@ __all__ = ["SourceTests", "source_tests"]
 
 # The columns of `SourceTests.z`.
 KINDS = {"chi-square": [0], "light": [1], "position": [2, 3], "size and shape": [4, 5, 6]}
+PLACE = [1, 2]  # of the scores
 LEFT = 0.1  # share of a score's variance that the fit must leave
 FEWEST = 25.0  # counts that a score rests on, or its tail is not known
 NORMAL = 2.5  # standard deviations up to which no tail is looked at
@@ -169,6 +170,9 @@ def source_tests(
     tested = known & (share > LEFT * np.where(alone > 0.0, alone, 1.0))
     tested[:, 0] &= not free
     z = np.where(tested, z / np.sqrt(np.where(tested, share, 1.0)), np.nan)
+    if posterior.nuisances.position_scatter and tested[:, PLACE].any():
+        # the scatter at the maximum is too small by what the coefficients took
+        z[:, PLACE] *= np.sqrt(np.mean((share / alone)[:, PLACE][tested[:, PLACE]]))
     variance, slope = 1.0 / fits.sums.weight, _slope(posterior, params, fits)
     for k in range(z.shape[1]):
         weights = np.einsum("ij,ji->i", root[owner, k], weighted)

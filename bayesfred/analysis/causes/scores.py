@@ -72,11 +72,13 @@ def hidden_causes(
         profile = float(squares[:, [0, *KINDS["size and shape"]]].sum())
         text = f"{failed.size} of {own.size} sources do not look like the PSF"
         findings.append(Finding(Cause("PSF", 0.0, text, "fit another PSF"), profile, "PSF", RICHER))
+    others = squares[~tests.failed] if few else squares
     for spread in tests.failed_spreads:
         kind, text, remedy = SPREADS[spread.name]
         pixel = posterior.model.detector.binning if spread.name == "positions" else 1.0
         cause = Cause(spread.name, 0.0, text.format(spread.estimate / pixel), remedy)
-        findings.append(Finding(cause, float(squares[:, KINDS[kind]].sum()), spread.name, RICHER))
+        explained = float(others[:, KINDS[kind]].sum())
+        findings.append(Finding(cause, explained, spread.name, RICHER))
     total = max([float(own.sum()), *(finding.explained for finding in findings)], default=0.0)
     return ranked(findings, total)
 
