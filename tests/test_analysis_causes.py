@@ -11,6 +11,7 @@ from bayesfred.analysis.causes.cause import Finding
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.find import ranked
 from bayesfred.analysis.causes.pixels import full_pixels
+from bayesfred.analysis.residuals import judge_residuals
 from bayesfred.analysis.verdict import judge_fit
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
@@ -27,8 +28,9 @@ FRAMES = 50
 
 def judged(posterior: Posterior) -> Any:
     """The verdict on the fit at the maximum."""
-    estimate = find_map(posterior)
-    return judge_fit(posterior, estimate, fit_statistics(posterior, estimate.params))
+    best = find_map(posterior)
+    residuals = judge_residuals(posterior, best.params, best.covariance)
+    return judge_fit(posterior, best, fit_statistics(posterior, best.params), residuals)
 
 
 def named_first(name: str, seeds: range) -> int:

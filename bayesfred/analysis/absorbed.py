@@ -28,6 +28,9 @@ class Absorbed(NamedTuple):
 
     leverage: Floats  # (ny * nx,)
     modes: Floats  # (samples, 4): their products within a source are minus the covariances
+    response: Floats  # (s, 4, d) G', changes of the template coefficients by the parameters
+    spread: Floats  # (s, 4, 4) B, covariance of the template coefficients
+    alone: Floats  # (s, 4, 4) K^-1, what of it remains if the parameters are known
 
 
 def responses(posterior: Posterior, params: Floats, fits: SourceFits) -> Floats:
@@ -52,7 +55,7 @@ def absorbed(
     """Leverages and covariances of the residuals."""
     own, owner, weight = fits.own, fits.owner, fits.sums.weight
     response, free = responses(posterior, params, fits), posterior.nuisances.profiled
-    spread = np.zeros((fits.fluxes.size, 4, 4))
+    alone = np.zeros((fits.fluxes.size, 4, 4))
     if free:
         prior = np.ones(free)  # of a relative flux; Gamma(2) adds 1 / F^2
         if free > 1:
@@ -60,8 +63,8 @@ def absorbed(
             prior[1:] = scatter**-2.0
         inverse = np.linalg.inv(fits.information[:, :free, :free] + np.diag(prior))
         response[:, :free] -= inverse @ fits.information[:, :free] @ response
-        spread[:, :free, :free] = inverse
-    spread += response @ covariance @ response.swapaxes(1, 2)
+        alone[:, :free, :free] = inverse
+    spread = alone + response @ covariance @ response.swapaxes(1, 2)
     values, vectors = np.linalg.eigh(spread)
     factors = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     modes = np.zeros((own.pixel.size, 4))
@@ -70,4 +73,4 @@ def absorbed(
             modes[:, k] += own.templates[m] * factors[owner, m, k]
     modes *= np.sqrt(weight)[:, None]
     leverage = np.bincount(own.pixel, np.sum(modes**2, axis=1), posterior.mask.size)
-    return Absorbed(np.minimum(leverage, 0.99), modes)
+    return Absorbed(np.minimum(leverage, 0.99), modes, response, spread, alone)

@@ -8,13 +8,22 @@ E. B. Wilson, M. M. Hilferty (1931), PNAS 17, 684: a normal deviate from a chi-s
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 
 from bayesfred.io.summary_table import Table, make_table
 
-__all__ = ["Check", "check_table", "deviate", "deviate_of_ratio", "not_tested", "sums"]
+__all__ = [
+    "Check",
+    "check_table",
+    "deviate",
+    "deviate_of_ratio",
+    "largest_deviate",
+    "not_tested",
+    "sums",
+]
 
 
 class Check(NamedTuple):
@@ -55,10 +64,18 @@ def deviate_of_ratio(f: float, dof: int, left: float) -> float:
     return float(((1.0 - other) * root - 1.0 + one) / math.sqrt(other * root**2 + one))
 
 
-def deviate(chi2: float, dof: int) -> float:
+def deviate(chi2: Any, dof: Any) -> Any:
     """The normal deviate that is exceeded about as rarely as this chi-square."""
     part = 2.0 / (9.0 * dof)
-    return float(((chi2 / dof) ** (1.0 / 3.0) - 1.0 + part) / math.sqrt(part))
+    return ((chi2 / dof) ** (1.0 / 3.0) - 1.0 + part) / np.sqrt(part)
+
+
+def largest_deviate(z: float, number: int) -> float:
+    """The normal deviate that is exceeded as rarely as this |z| by the largest of several."""
+    one = 2.0 * special.ndtr(-abs(z))
+    if one < 1e-290:  # hardly any number of tests makes a difference then
+        return abs(float(z))
+    return float(-special.ndtri(-math.expm1(number * math.log1p(-one))))
 
 
 def sums(fit: Mapping[str, float]) -> list[Check]:

@@ -26,6 +26,7 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.causes import Cause
 from bayesfred.analysis.checks import check_table, sums
 from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_checks
+from bayesfred.analysis.robust import robust_sd
 from bayesfred.analysis.sensitivity import sensitivities
 from bayesfred.analysis.verdict import (
     MIN_EFFICIENCY,
@@ -58,7 +59,8 @@ class Diagnostics:
         those of the Laplace approximation, and what is said of sampling below is nan.
     fits_data : bool
         Whether deviance and Pearson's statistic are what the noise makes them, within 5 standard
-        deviations, and enough sources are matched. It says nothing of the sampling.
+        deviations, enough sources are matched, and no score test and no source fails. It says
+        nothing of the sampling.
     sentences : tuple of str, length 3
         How well the model fits, and probably why it does not; how well it is sampled; what the
         error bars leave out.
@@ -105,13 +107,17 @@ class Diagnostics:
         A coefficient of the distortion is among them only if the prior decides a displacement that
         it takes part in: the sensitivity of the displacement along the coefficient's pattern over
         the frame is at least 0.05 too.
+    robust_sd : dict of str to float
+        Where the model does not fit: standard deviations that follow from the scatter between
+        sources, by parameter, see `bayesfred.analysis.robust`. Empty where it fits.
     residuals : Residuals or None
         The table of sources, and what the residuals show; None for a density that is not a
         `Posterior` of a frame.
     checks : astropy.table.Table
         A row for each check of the fit, with the columns name, value, expected, sd, z and meaning:
-        the two sums above, the randomised PIT, the whiteness of the residuals, displacement against
-        pixel phase, and the posterior predictive draws that were asked for.
+        the two sums above, the scores of what is not fitted, the source that is farthest off in
+        each way, the randomised PIT, the whiteness of the residuals, displacement against pixel
+        phase, and the posterior predictive draws that were asked for.
     """
 
     sampled_well: bool | None
@@ -140,6 +146,7 @@ class Diagnostics:
     prior_sensitivity: dict[str, float]
     likelihood_sensitivity: dict[str, float]
     prior_dominated: tuple[str, ...]
+    robust_sd: dict[str, float]
     residuals: Residuals | None = field(repr=False, compare=False)
     checks: Table = field(repr=False, compare=False)
 
@@ -190,7 +197,8 @@ class Diagnostics:
         Returns
         -------
         astropy.table.Table
-            See `bayesfred.sampling.summary.summary`.
+            See `bayesfred.sampling.summary.summary`. Where the model does not fit there is a column
+            `robust_sd` besides, see `bayesfred.analysis.robust`.
         """
         table = summary(chain, truth=truth, columns=self.columns)
         table.meta.update(self.verdict)
@@ -199,7 +207,8 @@ class Diagnostics:
     @property
     def columns(self) -> dict[str, dict[str, float]]:
         """What there is to say of every parameter, for `bayesfred.sampling.summary.summary`."""
-        return {
+        robust = {"robust_sd": self.robust_sd} if self.robust_sd else {}
+        return robust | {
             "rhat": self.rhat,
             "ess_bulk": self.ess_bulk,
             "ess_tail": self.ess_tail,
@@ -215,8 +224,9 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     Sampled well means: largest R-hat at most 1.01, every bulk and tail effective sample size at
     least `target_ess`, at least one move in ten accepted, and a MAP at which the gradient vanishes.
     The model fits where deviance and Pearson's statistic at the MAP are within 5 standard
-    deviations of their expectations and enough sources are matched; else `causes` says why. Of
-    draws of the Laplace approximation the importance efficiency is judged instead.
+    deviations of their expectations, enough sources are matched, and no score test and no source
+    fails; else `causes` says why. Of draws of the Laplace approximation the importance efficiency
+    is judged instead.
 
     Parameters
     ----------
@@ -241,8 +251,13 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape
-    fit = fit_statistics(posterior, chain.estimate.params)
-    fitted = judge_fit(posterior, chain.estimate, fit)
+    best = chain.estimate
+    fit = fit_statistics(posterior, best.params)
+    residuals, checks, robust = None, sums(fit), {}
+    if isinstance(posterior, Posterior):
+        residuals = judge_residuals(posterior, best.params, best.covariance)
+        checks += residuals.checks
+    fitted = judge_fit(posterior, best, fit, residuals)
     rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
     acceptance = efficiency = np.nan
     sampled_well = None
@@ -257,10 +272,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     else:
         efficiency = importance_efficiency(chain)
         sampling = judge_approximation(chain, efficiency)
-    residuals, checks = None, sums(fit)
-    if isinstance(posterior, Posterior):
-        residuals = judge_residuals(posterior, chain.estimate.params, chain.estimate.covariance)
-        checks += residuals.checks
+    if residuals is not None and not fitted.fits_data:
+        robust = _by_name(names, robust_sd(posterior, best.params, best.covariance))
     if predictive:
         draws = chain.draws()
         some = np.linspace(0, len(draws) - 1, min(predictive, len(draws))).astype(int)
@@ -283,6 +296,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         prior_sensitivity=_by_name(names, sensitivity.prior),
         likelihood_sensitivity=_by_name(names, sensitivity.likelihood),
         prior_dominated=tuple(np.array(names)[sensitivity.prior_dominated].tolist()),
+        robust_sd=robust,
         residuals=residuals,
         checks=check_table(checks),
         **fit,

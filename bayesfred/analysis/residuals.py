@@ -29,6 +29,8 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.absorbed import absorbed
 from bayesfred.analysis.checks import Check, deviate, not_tested
 from bayesfred.analysis.pixel_phase import PixelPhase, phase_check, pixel_phase
+from bayesfred.analysis.score_tests import ScoreTests, score_tests
+from bayesfred.analysis.source_tests import SourceTests, source_tests
 from bayesfred.analysis.sources import SourceFits, fit_sources, tabulate
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
@@ -52,12 +54,19 @@ class Residuals:
         The randomised PIT; None where the noise model has no distribution function.
     phases : tuple of PixelPhase
         Displacements along u and along v against the pixel phase.
+    scores : ScoreTests
+        Of what the model does not fit.
+    tests : SourceTests
+        Of every source.
     checks : tuple of Check
+        All of these in one number each.
     """
 
     sources: Table
     pit: Floats | None
     phases: tuple[PixelPhase, PixelPhase]
+    scores: ScoreTests
+    tests: SourceTests
     checks: tuple[Check, ...]
 
 
@@ -85,11 +94,19 @@ def judge_residuals(
     taken = absorbed(posterior, params, covariance, fits)
     pit = randomised_pit(posterior, fits, level, seed=seed, leverage=taken.leverage)
     phases = pixel_phase(posterior, params, covariance, fits)
+    scores = score_tests(posterior, params)
+    tests = source_tests(posterior, params, covariance, fits, taken)
+    sources = tabulate(posterior, fits)
+    sources["failed"] = tests.failed
     return Residuals(
-        tabulate(posterior, fits),
+        sources,
         pit,
         phases,
+        scores,
+        tests,
         (
+            *scores.checks,
+            *tests.checks,
             pit_check(pit),
             *_whiteness(posterior, fits, level, taken.modes),
             *(phase_check(phase, axis) for phase, axis in zip(phases, "uv", strict=True)),

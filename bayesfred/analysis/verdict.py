@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.analysis.causes import Cause, find_causes
-from bayesfred.model.posterior import Posterior
+from bayesfred.analysis.causes import Cause, find_causes, hidden_causes
+from bayesfred.analysis.residuals import Residuals
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
@@ -59,40 +59,51 @@ class FitVerdict:
     unmatched: str
 
 
-def judge_fit(posterior: Any, estimate: MapEstimate, fit: Mapping[str, float]) -> FitVerdict:
+def judge_fit(
+    posterior: Any, estimate: MapEstimate, fit: Mapping[str, float], residuals: Residuals | None
+) -> FitVerdict:
     """Judge whether a model fits the counts at its maximum.
 
     It does where deviance and Pearson's statistic are within 5 standard deviations of their
-    expectations, enough sources are matched, see `bayesfred.optimize.matched`, and the maximum was
-    not found by rejecting most of them.
+    expectations, enough sources are matched (see `bayesfred.optimize.matched`), neither a score
+    test nor a source fails, and the maximum was not found by rejecting a large part of the sources.
+    Of true models at most 1 % fail, all tests together.
 
     Parameters
     ----------
     posterior : Posterior
-        Of another density with counts only the sums are judged.
     estimate : MapEstimate
     fit : mapping of str to float
         See `fit_statistics`.
+    residuals : Residuals or None
+        See `judge_residuals`. None for another density with counts: only the sums are judged.
 
     Returns
     -------
     FitVerdict
     """
-    fits, causes, matched, unmatched = consistent(fit), tuple[Cause, ...](), "", ""
-    params = estimate.params
-    if isinstance(posterior, Posterior):
+    consist, failures, causes = consistent(fit), "", tuple[Cause, ...]()
+    params, matched, unmatched = estimate.params, "", ""
+    if residuals is not None:
         light = source_light(posterior, params)
-        enough = enough_matched(posterior, light)
         matched = f", {light.matched.sum()} of {len(light.matched)} sources matched"
-        if not enough:
-            fits, unmatched = False, matched.removeprefix(", ")
-        if not fits:
+        if not enough_matched(posterior, light):
+            consist, unmatched = False, matched.removeprefix(", ")
+        failures = _failures(residuals)
+        if not consist:
             causes = find_causes(posterior, params)
+        causes = causes or hidden_causes(posterior, residuals.scores, residuals.tests)
+    fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
     if fits and not estimate.fits_data:
         fits, sentence = False, f"The model does not fit all counts: {estimate.message}."
     elif fits:
         sentence = f"The model fits the counts: {sums} expectation{matched}."
+    elif consist:
+        sentence = (
+            f"The model does not fit the counts: {failures}, where sums over all pixels do not "
+            f"show it ({sums} expectation{matched}). {_why(causes)}"
+        )
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
@@ -217,6 +228,22 @@ def _sum(fit: Mapping[str, float], name: str) -> str:
     side = "below" if excess < 0.0 else "above"
     head = "deviance" if name == "deviance" else "Pearson's statistic"
     return f"{head} {abs(excess):.1f} standard deviations {side}"
+
+
+def _failures(residuals: Residuals) -> str:
+    """The score tests and the sources that fail, in words."""
+    scores, tests = residuals.scores, residuals.tests
+    parts = [
+        f"{lead.name} is {abs(lead.z):.0f} standard deviations from zero score"
+        for lead in scores.leading[:1]
+    ]
+    if tests.failed.any():
+        parts.append(f"{tests.failed.sum()} of {tests.failed.size} sources do not fit")
+    parts += [
+        f"the sources' {spread.name} scatter by {spread.z:.0f} standard deviations too much"
+        for spread in tests.failed_spreads
+    ]
+    return ", ".join(parts)
 
 
 def _why(causes: tuple[Cause, ...]) -> str:

@@ -238,7 +238,7 @@ def _row(values: dict[str, Any], parameter: Parameter, levels: Floats) -> dict[s
     scale = scale_of(values["mean"], values["sd"])
     cells: dict[str, str] = {
         key: _minus(scale.number(values[key]))
-        for key in ("truth", "MAP", "mean", "sd")
+        for key in ("truth", "MAP", "mean", "sd", "robust_sd")
         if key in values
     }
     bounds = [_minus(scale.number(level)) for level in levels]

@@ -77,6 +77,7 @@ def parameter_table(summary: Any, width: int) -> Table:
         _Column("truth", values("truth"), 4),
         _Column("MAP", values("MAP"), 6),
         _Column("posterior mean +- sd", means),
+        _Column("robust sd", values("robust_sd")),
         _Column("z", numbers("z", "+.2f"), 2),
         _Column("px at corner", corners, 1),
         _Column("R-hat", numbers("rhat", ".3f"), 5),

@@ -21,7 +21,7 @@ PSF. The richer one explains at least as much; it is named only if it explains c
 what one cause claims is not claimed again: a later cause has to explain a share of its own.
 
 `context` holds what the hypotheses share, `pixels`, `positions`, `search` and `light` the
-hypotheses, `find` ranks them.
+hypotheses, `find` ranks them. `scores` names what tests find where no sum shows a misfit.
 
 References
 ----------
@@ -30,5 +30,6 @@ P. McCullagh, J. A. Nelder (1989), Generalized Linear Models, chapter 2: analysi
 
 from bayesfred.analysis.causes.cause import Cause
 from bayesfred.analysis.causes.find import find_causes
+from bayesfred.analysis.causes.scores import hidden_causes
 
-__all__ = ["Cause", "find_causes"]
+__all__ = ["Cause", "find_causes", "hidden_causes"]

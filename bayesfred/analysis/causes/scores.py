@@ -1,0 +1,118 @@
+"""Causes that sums over all pixels hide: numbers that are wrong, and sources that are.
+
+They come from the tests of `bayesfred.analysis.score_tests` and `bayesfred.analysis.source_tests`.
+The misfit that they share out is that of the sources' own scores: the excess of the sum of their
+squares. Numbers in the model explain the squares of their scores, one beside those before it.
+"""
+
+import numpy as np
+
+from bayesfred._typing import Ints
+from bayesfred.analysis.causes.cause import Cause, Finding
+from bayesfred.analysis.causes.find import ranked
+from bayesfred.analysis.causes.light import FEW, NAMED, RICHER
+from bayesfred.analysis.score_tests import Lead, ScoreTests
+from bayesfred.analysis.source_tests import KINDS, SourceTests
+from bayesfred.model.posterior import Posterior
+
+MORE_TERMS = (
+    "missing terms",
+    "add terms to the distortion, such as a polynomial of a higher degree",
+)
+# The cause, and what frees a number that a score test finds wrong, by the beginning of its name.
+REMEDIES = {
+    "flux_scale": ("fluxes", 'set nuisances.flux = "scale"'),
+    "offset": ("shift", "set nuisances.offset = true"),
+    "psf_sigma": ("PSF", "let it be free (nuisances.psf_sigma = true), or correct the PSF's width"),
+    "background": ("background", "raise nuisances.background_order"),
+    "f_": MORE_TERMS,
+    "g_": MORE_TERMS,
+}
+# Which columns of the sources' deviates, what is found, and what to do.
+SPREADS = {
+    "fluxes": (
+        "light",
+        "the sources have other fluxes than the catalogue's, by some {:.1%} each",
+        'set nuisances.flux = "free"',
+    ),
+    "positions": (
+        "position",
+        "the sources lie off their places, by some {:.2g} pixels along each axis",
+        'set nuisances.flux = "free" and nuisances.position_scatter = true',
+    ),
+}
+
+
+def hidden_causes(
+    posterior: Posterior, scores: ScoreTests, tests: SourceTests
+) -> tuple[Cause, ...]:
+    """The failed tests as causes.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    scores : ScoreTests
+    tests : SourceTests
+
+    Returns
+    -------
+    tuple of Cause
+        The most likely one first; empty where no test fails.
+    """
+    squares = np.where(np.isfinite(tests.z), tests.z**2 - 1.0, 0.0)
+    own = np.sum(squares[:, 1:], axis=1)
+    findings = [_numbers(name, leads) for name, leads in _by_remedy(scores.leading).items()]
+    failed = np.flatnonzero(tests.failed)
+    few = failed.size <= max(2, FEW * own.size)
+    if failed.size and few:
+        # what no score describes shows in the chi-square
+        held = np.maximum(own, squares[:, 0])[failed]
+        findings.append(_few_sources(posterior, failed[np.argsort(-held)], float(held.sum())))
+    elif failed.size:
+        profile = float(squares[:, [0, *KINDS["size and shape"]]].sum())
+        text = f"{failed.size} of {own.size} sources do not look like the PSF"
+        findings.append(Finding(Cause("PSF", 0.0, text, "fit another PSF"), profile, "PSF", RICHER))
+    others = squares[~tests.failed] if few else squares
+    for spread in tests.failed_spreads:
+        kind, text, remedy = SPREADS[spread.name]
+        pixel = posterior.model.detector.binning if spread.name == "positions" else 1.0
+        cause = Cause(spread.name, 0.0, text.format(spread.estimate / pixel), remedy)
+        explained = float(others[:, KINDS[kind]].sum())
+        findings.append(Finding(cause, explained, spread.name, RICHER))
+    total = max([float(own.sum()), *(finding.explained for finding in findings)], default=0.0)
+    return ranked(findings, total)
+
+
+def _by_remedy(leading: tuple[Lead, ...]) -> dict[tuple[str, str], list[Lead]]:
+    """Numbers that go by the same name and remedy."""
+    groups: dict[tuple[str, str], list[Lead]] = {}
+    for lead in leading:
+        which = next(text for start, text in REMEDIES.items() if lead.name.startswith(start))
+        groups.setdefault(which, []).append(lead)
+    return groups
+
+
+def _numbers(which: tuple[str, str], leads: list[Lead]) -> Finding:
+    """Numbers that are wrong."""
+    (name, remedy), first = which, leads[0]
+    text = (
+        f"{first.name} is {abs(first.z):.0f} standard deviations from zero score: the counts ask "
+        f"for {first.value + first.step:.4g} in place of {first.value:.4g}"
+    )
+    if more := ", ".join(lead.name for lead in leads[1:]):
+        text += f" (further: {more})"
+    return Finding(Cause(name, 0.0, text, remedy), sum(lead.z**2 for lead in leads), name)
+
+
+def _few_sources(posterior: Posterior, failed: Ints, explained: float) -> Finding:
+    """Sources that are not what the catalogue says."""
+    s = posterior.model.sources
+    names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in failed[:NAMED])
+    more = ", ..." if failed.size > NAMED else ""
+    cause = Cause(
+        "wrong sources", 0.0,
+        f"{failed.size} of {len(s)} sources do not fit: rows of the catalogue, from 0: "
+        f"{names}{more}",
+        "correct their positions and fluxes, or leave them out",
+    )  # fmt: skip
+    return Finding(cause, explained, "wrong sources")
