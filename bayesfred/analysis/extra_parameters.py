@@ -74,7 +74,10 @@ class ExtraParameters:
             if len(self.names) == 1
             else f"{len(self.names)} parameters with chi-square {self.chi2:.1f}"
         )
-        return f"{size}, errors {self.widening:.1f} times wider by sources, p = {self.p:.2g}"
+        return (
+            f"{size}; p = {self.p:.2g} by the scatter of sources, which makes errors "
+            f"{self.widening:.1f} times the posterior's"
+        )
 
 
 def judge_extra(
@@ -106,8 +109,8 @@ def judge_extra(
     --------
     >>> change = np.array([[-0.6], [-0.1], [0.7]])
     >>> judged = judge_extra(("f_x",), np.array([9.0]), np.eye(1), 0.9 * change, change)
-    >>> print(judged, judged.real)
-    f_x 9.0 sd from the leaner model's value, errors 0.9 times wider by sources, p = 0.0094 True
+    >>> print(f"{judged.chi2:.0f}, {judged.widening:.2f}, {judged.p:.4f}, {judged.real}")
+    81, 0.88, 0.0094, True
     """
     inverted, size = inverse(covariance), difference.size
     chi2 = float(difference @ inverted @ difference)
