@@ -4,6 +4,7 @@ from .analysis.choose_terms import TermChoice, choose_terms
 from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.evidence import Evidence, log_evidence
 from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
 from .analysis.photons import PhotonsNeeded, photons_needed
@@ -37,6 +38,7 @@ __all__ = [
     "Detector",
     "Diagnostics",
     "DisplacementField",
+    "Evidence",
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",
@@ -67,6 +69,7 @@ __all__ = [
     "find_causes",
     "find_map",
     "laplace",
+    "log_evidence",
     "noise_study",
     "open_chain",
     "photons_needed",

@@ -192,7 +192,7 @@ def compare(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Rank models of one frame by how well they predict every pixel from the others."""
+    """Rank models of one frame by how well they predict sources that are left out."""
     _run(
         lambda: bf.show.show_comparison(
             bf.commands.compare(chain_files, out=out, overwrite=overwrite)

@@ -328,7 +328,7 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Ve
 def compare(
     chain_files: Sequence[PathLike], *, out: PathLike | None = None, overwrite: bool = False
 ) -> Compared:
-    """Rank models of one frame by leave-one-out predictive accuracy, and show runs side by side.
+    """Rank models of one frame by how well they predict sources, and show runs side by side.
 
     Parameters
     ----------

@@ -129,12 +129,10 @@ def show_comparison(compared: Compared) -> bool:
     if ranking is None:
         print(f"not ranked: {compared.reason}")
         return False
-    print(
-        f"chosen: {printable(ranking.chosen)}, the one with the fewest parameters that predicts "
-        "as well as the best"
-    )
+    for sentence in ranking.sentences:
+        print(printable(sentence))
     if not ranking.reliable:
-        print("not reliable: few draws decide some pixels' weights (Pareto k): find bad pixels")
+        print("not reliable: few draws decide the evidence without some sources (Pareto k)")
     return ranking.reliable
 
 

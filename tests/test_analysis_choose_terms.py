@@ -83,7 +83,7 @@ def test_densities_of_folds_are_those_of_a_normal_distribution() -> None:
     posterior = Posterior(model, counts, prior=prior, noise=GaussianNoise(variance))
     top = find_map(posterior)
     folds = fold_sources(posterior, top.params, 9)
-    found = module._predicted(module._Fit(1, posterior, top), folds)
+    found = module._predicted(module._Fit(1, posterior, top), folds).score
     slopes = [*model.jacobian(top.params[:4]), np.ones(model.detector.shape)]
     jacobian = np.stack([slope.ravel() for slope in slopes], axis=1)
     means, sds = np.array([(p.mean(), p.std()) for p in posterior.prior.values()]).T
@@ -144,6 +144,17 @@ def test_cubic_terms_are_found_behind_quadratic_ones_that_bring_nothing() -> Non
     assert f"degree {leaner['degree']}, with {leaner['n_terms']} terms" in choice.message
     assert f"{leaner['cost']:.1f} +- {leaner['cost_se']:.1f}" in choice.message
     assert len(choice.lines()) == len(choice.tried)
+
+
+def test_terms_of_other_degrees_are_judged_by_their_size() -> None:
+    choice = choose_terms(posterior_of(*truth_of(2, 2), 2))
+    leaner, chosen, *larger = choice.tried["p"]
+    assert leaner < 1e-6 and np.isnan(chosen) and min(larger) > 0.01
+    table = choice.tried.copy()
+    table["p"][-1] = 0.002
+    said = f"though terms of degree {table['degree'][-1]} are real (p = 0.002)"
+    assert said in module._message(table, 1) and said not in choice.message
+    assert choice.lines()[0].endswith(f"other terms are chance with p = {leaner:.2g}")
 
 
 def test_no_distortion_and_one_too_small_to_matter_take_the_leanest_polynomial() -> None:

@@ -191,7 +191,8 @@ def test_columns_without_numbers_are_left_out() -> None:
 def test_a_ranking_of_long_paths_fits() -> None:
     score = SimpleNamespace(
         name="chains/" + "x" * 90 + ".h5", n_parameters=12, elpd=-123456.7, elpd_se=123.4,
-        p_loo=12.3, difference=1234.5, difference_se=67.8, pareto_k=0.5,
+        difference=1234.5, difference_se=67.8, weight=0.25, log_evidence=-123456.7,
+        evidence_error=0.01, pareto_k=0.5,
     )  # fmt: skip
     other = SimpleNamespace(**{**vars(score), "pareto_k": -np.inf})
     for width in (80, 200):

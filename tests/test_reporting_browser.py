@@ -18,6 +18,7 @@ from test_reporting import BACKGROUND, TRUTH, described, figures_of, report, run
 import bayesfred as bf
 from bayesfred.analysis.comparison import Comparison, Score
 from bayesfred.analysis.diagnostics import Diagnostics
+from bayesfred.analysis.extra_parameters import ExtraParameters
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.sampling.record import RunRecord
@@ -72,8 +73,11 @@ def page(folder: Path, kind: str) -> Path:
     if kind == "compared":
         found = diagnostics, found_with_causes(diagnostics)
         runs = [ComparedRun(f"chains/{k}.h5", chain, d) for k, d in enumerate(found)]
-        scores = [Score(run.name, 5, -9e4, 31.4, 5.0, 6.0, 2.0, 0.3, 0) for run in runs]
-        ranking = Comparison(tuple(scores), runs[0].name)
+        parts = np.array([1.0, -2.0, 3.0])
+        scores = [Score(run.name, 5, -9e4, 31.4, 6.0, 2.0, 0.5, -9e4, 0.01, 0.3, 0, parts)
+                  for run in runs]  # fmt: skip
+        extra = {(runs[0].name, runs[1].name): ExtraParameters(("f_x",), 12.2, 1.1, 0.003)}
+        ranking = Comparison(tuple(scores), runs[0].name, ((0,), (1, 2), (3, 4)), extra)
         return write_comparison(folder / "report.html", runs, ranking)
     if kind == "red":
         diagnostics = found_with_causes(diagnostics)

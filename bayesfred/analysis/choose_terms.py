@@ -22,6 +22,10 @@ freedom on the pixels that they are fitted to, and lose k on others. A lens may 
 and no quadratic ones, so the search ends at the second degree in a row that does not improve on the
 best one before it.
 
+A term may be real and yet too small to predict better by that much. So the terms by which a
+polynomial differs from the chosen one are judged too, by their size and by their scatter between
+the folds (`extra_parameters`).
+
 References
 ----------
 S. Geisser (1975), JASA 70, 320: predictive sample reuse.
@@ -38,7 +42,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
-from bayesfred.analysis.folds import Folds, fold_sources
+from bayesfred.analysis.extra_parameters import REAL, judge_extra
+from bayesfred.analysis.folds import Folds, fold_sources, require_sources
 from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.io.summary_table import Table, make_table
@@ -50,7 +55,6 @@ from bayesfred.optimize.newton import NewtonResult, maximize
 __all__ = ["TermChoice", "choose_terms"]
 
 FOLDS = 10
-FEWEST = 3  # sources
 SCOUT = 3  # degree of the polynomial that says where the images are
 FAILURES = 2  # degrees in a row that do not improve, after which the search ends
 HIGHEST = 9  # degree; above it powers of pixels leave float64 too few digits
@@ -70,10 +74,12 @@ class TermChoice:
     tried : astropy.table.Table
         A row for each polynomial: `degree`; `n_terms`; `elpd` and `elpd_se`, its predictive
         accuracy with the standard error; `cost` and `cost_se`, by how much less than the chosen one
-        it predicts, with the difference's standard error; `change`, by how much it displaces
-        images elsewhere than the chosen one at most over the field, pixel.
+        it predicts, with the difference's standard error; `p`, the probability that the terms
+        that only it or only the chosen one has are chance, nan of the chosen one; `change`, by how
+        much it displaces images elsewhere than the chosen one at most over the field, pixel.
     message : str
-        What was chosen, and what the next leaner polynomial would cost.
+        What was chosen, what the next leaner polynomial would cost, and which of the larger ones
+        have terms that are real though they do not predict better.
     """
 
     distortion: PolynomialDistortion
@@ -88,7 +94,7 @@ class TermChoice:
             *(
                 f"degree {row['degree']}: {row['n_terms']} terms, predicts sources worse by "
                 f"{row['cost']:.1f} +- {row['cost_se']:.1f}, displaces images by up to "
-                f"{row['change']:.2g} pixel"
+                f"{row['change']:.2g} pixel, other terms are chance with p = {row['p']:.2g}"
                 for row in self.tried
                 if row["n_terms"] != self.distortion.n_terms
             ),
@@ -102,6 +108,15 @@ class _Fit(NamedTuple):
     degree: int
     posterior: Posterior
     top: MapEstimate
+
+
+class _Tried(NamedTuple):
+    """A polynomial fitted to all pixels, and without each fold."""
+
+    fit: _Fit
+    score: Floats  # (K,) log predictive density of each fold
+    influence: Floats  # (K, d) of each fold on the estimates
+    change: Floats  # (K, d) of the estimates when it is left out
 
 
 def choose_terms(posterior: Posterior) -> TermChoice:
@@ -147,19 +162,17 @@ def choose_terms(posterior: Posterior) -> TermChoice:
         scouts = [*itertools.islice(fits, SCOUT)]
         last = scouts[-1]
         folds = fold_sources(last.posterior, last.top.params, FOLDS)
-        _require_sources(folds)
-        tried: list[_Fit] = []
-        scores: list[Floats] = []
+        require_sources(folds)
+        tried: list[_Tried] = []
         best = 0
         for fit in itertools.chain(scouts, fits):
-            tried.append(fit)
-            scores.append(_predicted(fit, folds))
-            gain, error = _total(scores[-1] - scores[best])
+            tried.append(_predicted(fit, folds))
+            gain, error = _total(tried[-1].score - tried[best].score)
             if gain > error:
                 best = len(tried) - 1
             elif len(tried) - 1 - best >= FAILURES:
                 break
-        return _choice(tried, scores, best, folds)
+        return _choice(tried, best, folds)
 
 
 def _fits(posterior: Posterior) -> Iterator[_Fit]:
@@ -195,21 +208,19 @@ def _carried(fit: _Fit, to: Posterior) -> Floats:
     return np.array([known.get(name, 0.0) for name in to.parameter_names])
 
 
-def _require_sources(folds: Folds) -> None:
-    number = int(np.sum(folds.sources >= 0))
-    if number < FEWEST:
-        raise InputError(
-            f"catalogue: got {number} sources with an image in the frame, expected at least "
-            f"{FEWEST} to predict some from the others: check positions and mask, or name the terms"
-        )
-
-
-def _predicted(fit: _Fit, folds: Folds) -> Floats:
-    """Log predictive density of every fold given the others."""
+def _predicted(fit: _Fit, folds: Folds) -> _Tried:
+    """Fit a polynomial without each fold, and predict the fold."""
     whole = _log_evidence(fit.top)
     number = int(folds.sources.max()) + 1
-    rest = (maximize(folds.without(fit.posterior, k), fit.top.params) for k in range(number))
-    return whole - np.array([_log_evidence(top) for top in rest])
+    rest = [folds.without(fit.posterior, k) for k in range(number)]
+    tops = [maximize(posterior, fit.top.params) for posterior in rest]
+    gradients = np.array([-posterior.gradient(fit.top.params) for posterior in rest])
+    return _Tried(
+        fit,
+        whole - np.array([_log_evidence(top) for top in tops]),
+        gradients @ fit.top.covariance,
+        fit.top.params - np.array([top.params for top in tops]),
+    )
 
 
 def _log_evidence(top: MapEstimate | NewtonResult) -> float:
@@ -224,29 +235,49 @@ def _total(values: Floats) -> tuple[float, float]:
     return float(values.sum()), float(np.sqrt(values.size * values.var(ddof=1)))
 
 
-def _choice(tried: Sequence[_Fit], scores: Sequence[Floats], best: int, folds: Folds) -> TermChoice:
+def _choice(tried: Sequence[_Tried], best: int, folds: Folds) -> TermChoice:
     """The record of what was tried."""
-    chosen = tried[best]
-    elpd = np.array([_total(score) for score in scores])
-    cost = np.array([_total(scores[best] - score) for score in scores])
-    change = np.array([_largest_change(chosen, other, folds.points) for other in tried])
+    fits, chosen = [each.fit for each in tried], tried[best].fit
+    elpd = np.array([_total(each.score) for each in tried])
+    cost = np.array([_total(tried[best].score - each.score) for each in tried])
     distortion = chosen.posterior.model.polynomial
     table = make_table(
         {
-            "degree": np.array([fit.degree for fit in tried]),
-            "n_terms": np.array([fit.posterior.model.distortion.n_terms for fit in tried]),
+            "degree": np.array([fit.degree for fit in fits]),
+            "n_terms": np.array([_size(each) for each in tried]),
             "elpd": elpd[:, 0],
             "elpd_se": elpd[:, 1],
             "cost": cost[:, 0],
             "cost_se": cost[:, 1],
-            "change": change,
+            "p": np.array([_chance(*sorted((each, tried[best]), key=_size)) for each in tried]),
+            "change": np.array([_largest_change(chosen, fit, folds.points) for fit in fits]),
         }
     )
     return TermChoice(distortion, chosen.posterior, chosen.top, table, _message(table, best))
 
 
+def _size(tried: _Tried) -> int:
+    """Number of terms."""
+    return tried.fit.posterior.model.distortion.n_terms
+
+
+def _chance(leaner: _Tried, larger: _Tried) -> float:
+    """Probability that the terms which only the larger polynomial has are chance."""
+    if leaner is larger:
+        return float("nan")
+    known, names = (tried.fit.posterior.parameter_names for tried in (leaner, larger))
+    added = [k for k, name in enumerate(names) if name not in known]
+    return judge_extra(
+        tuple(names[k] for k in added),
+        larger.fit.top.params[added],
+        larger.fit.top.covariance[np.ix_(added, added)],
+        larger.influence[:, added],
+        larger.change[:, added],
+    ).p
+
+
 def _message(tried: Table, best: int) -> str:
-    """What was chosen, what a leaner polynomial would cost, and why the search ended."""
+    """What was chosen, what others would bring, and why the search ended."""
     degrees, chosen = tried["degree"], tried[best]
     message = f"polynomial of degree {chosen['degree']} ({chosen['n_terms']} terms)"
     if best:
@@ -261,6 +292,9 @@ def _message(tried: Table, best: int) -> str:
     if larger := [str(degree) for degree in degrees[best + 1 :]]:
         plural = "s" if len(larger) > 1 else ""
         message += f"; degree{plural} {' and '.join(larger)} would not predict better"
+    for row in tried[best + 1 :]:
+        if row["p"] < REAL:
+            message += f", though terms of degree {row['degree']} are real (p = {row['p']:.2g})"
     if len(larger) < FAILURES:
         last = int(degrees[-1])
         message += (

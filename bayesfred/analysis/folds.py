@@ -21,7 +21,10 @@ from scipy import spatial
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.field import field_points
+from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
+
+FEWEST = 3  # sources
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,16 @@ def fold_sources(posterior: Posterior, params: Floats, number: int) -> Folds:
         owner = _owners(posterior, params, positions[there], posterior.fluxes(params)[there])
         pixels[posterior.mask] = sources[there][owner]
     return Folds(sources, pixels, _field_points(posterior, params, positions[there]))
+
+
+def require_sources(folds: Folds) -> None:
+    """Raise InputError if there are too few sources to predict some from the others."""
+    number = int(np.sum(folds.sources >= 0))
+    if number < FEWEST:
+        raise InputError(
+            f"catalogue: got {number} sources with an image in the frame, expected at least "
+            f"{FEWEST} to predict some from the others: check positions and mask"
+        )
 
 
 def _masked(posterior: Posterior, mask: Flags) -> Posterior:

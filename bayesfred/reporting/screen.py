@@ -164,8 +164,8 @@ def comparison_table(compared: Comparison, width: int) -> Table:
     ----------
     compared : Comparison
     width : int
-        Characters in a line. Where they do not suffice, columns are left out: p_loo first, then
-        Pareto k, elpd and the number of parameters.
+        Characters in a line. Where they do not suffice, columns are left out: elpd first, then
+        Pareto k, the stacking weight and the number of parameters.
 
     Returns
     -------
@@ -176,11 +176,14 @@ def comparison_table(compared: Comparison, width: int) -> Table:
         [
             _Column("model", [escape(printable(s.name)) for s in scores], justify="left"),
             _Column("parameters", [str(s.n_parameters) for s in scores], 1),
-            _Column("elpd", [f"{s.elpd:.1f} +- {s.elpd_se:.1f}" for s in scores], 2),
-            _Column("p_loo", [f"{s.p_loo:.1f}" for s in scores], 4),
+            _Column("elpd", [f"{s.elpd:.1f} +- {s.elpd_se:.1f}" for s in scores], 4),
             _Column(
                 "behind the best",
                 ["", *(f"{s.difference:.1f} +- {s.difference_se:.1f}" for s in scores[1:])],
+            ),
+            _Column("weight", [f"{s.weight:.2f}" for s in scores], 2),
+            _Column(
+                "log evidence", [f"{s.log_evidence:.1f} +- {s.evidence_error:.2f}" for s in scores]
             ),
             _Column(
                 "Pareto k",

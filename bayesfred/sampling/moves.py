@@ -19,6 +19,7 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, inverse
+from bayesfred.optimize.newton import NewtonResult
 
 HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
@@ -117,7 +118,11 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
 
     @classmethod
     def of(
-        cls, posterior: TargetDensity, estimate: MapEstimate, *, heavy_share: float = HEAVY_SHARE
+        cls,
+        posterior: TargetDensity,
+        estimate: MapEstimate | NewtonResult,
+        *,
+        heavy_share: float = HEAVY_SHARE,
     ) -> "LaplaceMove":
         """The move for a posterior, given its maximum.
 

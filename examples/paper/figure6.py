@@ -81,7 +81,7 @@ def make(quick: bool, folder: Path) -> Section:
         names[order] = f"{distortion.n_terms} terms (K = {order})"
         posterior = bf.Posterior(paper_model(distortion), counts)
         fits[names[order]] = fit(posterior, quick, f"log{order}", near, target_ess=400)
-    compared = bf.compare({name: f.chain for name, f in fits.items() if f.chain}, draws=200)
+    compared = bf.compare({name: f.chain for name, f in fits.items() if f.chain})
     scores = {s.name: s for s in compared.scores}
     rows += [
         Row(

@@ -74,14 +74,19 @@ def _make_templates(cluster, s, flux):
 
 @inner()
 def _start(cluster):
-    """Templates, and the least-squares flux of every source, its neighbours ignored."""
+    """Templates, and the least-squares flux of every source, its neighbours ignored.
+
+    The prior counts as a measurement of its mean, 2 scale, with its variance, 2 scale^2: a source
+    without pixels, or with a few far in its wings, starts there.
+    """
     fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
     patch, canvas = cluster.patch, cluster.canvas
     for s in cluster.group.members:
         _make_templates(cluster, s, 1.0)
         above = project(fp, s, stamps[0], patch.score, canvas.at)
         below = squared(fp, s, stamps[0], patch.weight, canvas.at)
-        fluxes[s] = max(above / below if below > 0.0 else 0.0, 0.01 * cluster.scale[s])
+        scale = cluster.scale[s]
+        fluxes[s] = max((above + 1.0 / scale) / (below + 0.5 / scale**2), 0.01 * scale)
         stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= fluxes[s]
         add_template(fp, s, stamps[0], fluxes[s], canvas)
 

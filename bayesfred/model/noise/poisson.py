@@ -132,8 +132,7 @@ class PoissonNoise(Noise):
         return hash(np.asarray(self.read_noise).tobytes())
 
     @property
-    def _counts_photons(self) -> bool:
-        """Whether there is no read noise."""
+    def discrete(self) -> bool:
         return isinstance(self.read_noise, float) and self.read_noise == 0.0
 
     @property
@@ -142,7 +141,7 @@ class PoissonNoise(Noise):
         return self.read_noise**2
 
     def terms(self, values: Floats) -> PoissonTerms | ReadNoiseTerms:
-        if self._counts_photons:
+        if self.discrete:
             return PoissonTerms()
         if isinstance(self.read_noise, float):
             return frame_terms(self.read_noise, values)
@@ -151,7 +150,7 @@ class PoissonNoise(Noise):
         return frame_terms(padded.ravel(), values)
 
     def constant(self, counts: Floats, used: Flags) -> float:
-        if self._counts_photons:
+        if self.discrete:
             return -float(np.sum(gammaln(np.maximum(counts[used], 0.0) + 1.0)))
         variance = np.broadcast_to(self._variance, counts.shape)[used]
         return float(np.sum(left_out(counts[used], variance)))
@@ -162,7 +161,7 @@ class PoissonNoise(Noise):
                 f"noise: read_noise: got shape {np.shape(self.read_noise)}, expected a number or "
                 f"the frame's shape {counts.shape}"
             )
-        if self._counts_photons and counts[used].min() < 0:
+        if self.discrete and counts[used].min() < 0:
             raise InputError(
                 f"counts: got {counts[used].min():g}, expected counts >= 0 without read noise: "
                 "check gain and pedestal, give read_noise, or mask these pixels"
@@ -175,22 +174,22 @@ class PoissonNoise(Noise):
 
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
         counts = rng.poisson(sources + background).astype(np.float64)
-        if self._counts_photons:
+        if self.discrete:
             return counts
         return counts + rng.normal(0.0, self.read_noise, counts.shape)
 
     def log_likelihood(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        if not self._counts_photons:
+        if not self.discrete:
             return log_likelihood(counts, mean, self.read_noise)
         return np.asarray(xlogy(counts, mean) - mean - gammaln(np.maximum(counts, 0.0) + 1.0))
 
     def score(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        if not self._counts_photons:
+        if not self.discrete:
             return score(counts, mean, self.read_noise)
         return counts / np.maximum(mean, NOTHING) - 1.0
 
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
-        if not self._counts_photons:
+        if not self.discrete:
             return information(mean, self.read_noise)
         return 1.0 / np.maximum(mean, NOTHING)
 
@@ -199,7 +198,7 @@ class PoissonNoise(Noise):
 
     def pearson_variance(self, mean: Floats, background: float | Floats) -> Floats:
         """Kurtosis of the counts less what the background explains of it; 2 without read noise."""
-        if self._counts_photons:
+        if self.discrete:
             return 2.0 * np.ones_like(mean)
         inverse = 1.0 / self.counts_variance(mean, background)
         explained = inverse / self.fisher_weight(mean, background)
@@ -208,7 +207,7 @@ class PoissonNoise(Noise):
     def cumulative(
         self, counts: Floats, mean: Floats, background: float | Floats, grain: float
     ) -> tuple[Floats, Floats]:
-        if not self._counts_photons:
+        if not self.discrete:
             half = 0.5 * grain
             return (
                 blurred_cdf(counts - half, mean, self.read_noise),
@@ -218,7 +217,7 @@ class PoissonNoise(Noise):
         return poisson_cdf(counts - half, mean), poisson_cdf(counts + half, mean)
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
-        if not self._counts_photons:
+        if not self.discrete:
             return deviance(counts, mean, self.read_noise)
         n = counts
         return np.asarray(2.0 * (xlogy(n, np.maximum(n, 0.0) / mean) - n + mean))
@@ -226,7 +225,7 @@ class PoissonNoise(Noise):
     def deviance_moments(
         self, mean: Floats, background: float | Floats
     ) -> tuple[Floats, Floats, Floats]:
-        if not self._counts_photons:
+        if not self.discrete:
             return moment_table(self.read_noise).deviance(mean, self.read_noise)
         return deviance_moments(mean)
 

@@ -22,6 +22,11 @@ class Noise(Protocol):
     belong to all pixels of the frame, or to those of `at`.
     """
 
+    @property
+    def discrete(self) -> bool:
+        """Whether counts are integers that have probabilities; others have densities."""
+        return False
+
     @abstractmethod
     def terms(self, values: Floats) -> Any:
         """The compiled half for a frame of padded rows, MASKED where a pixel is not used."""
