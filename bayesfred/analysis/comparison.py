@@ -47,6 +47,7 @@ from bayesfred.analysis.folds import Folds, fold_sources, require_sources
 from bayesfred.analysis.verdict import MIN_EFFICIENCY, judge_approximation, judge_sampling
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
@@ -283,7 +284,7 @@ def _require_sampled(name: str, chain: Chain) -> None:
     if chain.method == "mcmc":
         rhat, *ess = convergence(chain.chain[:, chain.burn_in :])
         acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
-        well, said = judge_sampling(chain, rhat, np.minimum(*ess), acceptance, chain.target_ess)
+        well, said = judge_sampling(chain, rhat, np.minimum(*ess), acceptance, chain.target_ess, "")
     else:
         efficiency = importance_efficiency(chain)
         well = efficiency >= MIN_EFFICIENCY and chain.estimate.at_maximum
@@ -302,7 +303,8 @@ def _left_out(chain: Chain, posterior: Posterior, evidence: Evidence, folds: Fol
     for k in range(int(folds.sources.max()) + 1):
         rest = folds.without(posterior, k)
         top = maximize(rest, start)
-        without, shape = importance_evidence(rest, top, DRAWS, random)
+        at = MapEstimate(top.params, top.covariance, top.log_prob, top.evaluations, "")
+        without, shape = importance_evidence(rest, at, DRAWS, random)
         found.append(without)
         shapes.append(shape)
         gradients.append(-rest.gradient(start))  # of the fold, as that of all vanishes

@@ -42,7 +42,6 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.newton import NewtonResult
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import effective_size
 from bayesfred.sampling.moves import LaplaceMove
@@ -121,7 +120,7 @@ def log_evidence(chain: Chain) -> Evidence:
 
 def importance_evidence(
     density: TargetDensity,
-    top: MapEstimate | NewtonResult,
+    top: MapEstimate,
     number: int,
     random: np.random.RandomState,
 ) -> tuple[Evidence, float]:
@@ -130,7 +129,7 @@ def importance_evidence(
     Parameters
     ----------
     density : TargetDensity
-    top : MapEstimate or NewtonResult
+    top : MapEstimate
         Its maximum.
     number : int
         Draws of the proposal.
@@ -168,7 +167,7 @@ def random_numbers(chain: Chain) -> np.random.RandomState:
 def _proposed(
     density: TargetDensity,
     move: LaplaceMove,
-    top: MapEstimate | NewtonResult,
+    top: MapEstimate,
     number: int,
     random: np.random.RandomState,
 ) -> Floats:

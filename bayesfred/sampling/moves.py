@@ -19,7 +19,6 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, inverse
-from bayesfred.optimize.newton import NewtonResult
 
 HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
@@ -120,7 +119,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     def of(
         cls,
         posterior: TargetDensity,
-        estimate: MapEstimate | NewtonResult,
+        estimate: MapEstimate,
         *,
         heavy_share: float = HEAVY_SHARE,
     ) -> "LaplaceMove":
