@@ -22,7 +22,7 @@ mass too. The draws estimate it, and the normal distribution that they come from
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +40,9 @@ HOPELESS = 60.0  # in log-likelihood; noise makes up for 3 sqrt(2 HOPELESS) = 33
 NEGLIGIBLE = 1e-4  # share of the mass
 SAME = 0.7  # images are moved by more PSF widths than this between two modes
 DRAWS = 1024
-MOST = 24  # searches from aliases, and from draws
-MOST_ALIASES = 64  # sources that are tried in one place
+MOST, MOST_DRAWS = 24, 256  # searches from draws, and draws that they may begin at
+MOST_ALIASES = 100  # searches from aliases
+REST = 1e-3  # weight of the least likely alias below which others do not matter
 BESIDE = 0.5  # PSF widths between a source and the one whose place it takes, at most
 LEAST_SHARE = 0.1  # of proposals between the modes
 WIDE = 0.1  # ... and of those that reach wherever the bright sources or the prior allow
@@ -90,30 +91,36 @@ def find_modes(posterior: Posterior, top: NewtonResult) -> ModeSearch:
     around = _Surroundings(posterior, top, light)
     draws = around.draws()
     found, evaluations = [top], 0 if draws is None else len(draws.params)
-    modes = [around.images(top.params)]
-    for starts in (around.aliases(), () if draws is None else draws.params):
+    modes, capped = [around.images(top.params)], False
+    some: Iterable[Floats] = () if draws is None else draws.params[:MOST_DRAWS]
+    floor = top.log_prob - HOPELESS
+    for starts, most in ((around.aliases(), MOST_ALIASES), (some, MOST)):
         tried: list[Floats] = []
         for start in starts:
             images = around.images(start)
-            if len(tried) == MOST or around.among(images, modes) or around.among(images, tried):
+            if around.among(images, modes) or around.among(images, tried):
                 continue
+            if len(tried) == most:
+                capped = most == MOST_ALIASES
+                break
             tried.append(images)
-            if not np.isfinite(posterior.log_prob(start)):
-                continue
-            near = maximize(posterior, start, steps=2)
-            evaluations += near.evaluations
-            if near.log_prob < top.log_prob - HOPELESS or around.among(
-                around.images(near.params), modes
-            ):
-                continue
-            again = maximize(posterior, near.params)
+            log_prob = float(posterior.log_prob(start))
+            if log_prob < floor:  # bright sources not quite in place
+                if not np.isfinite(log_prob):
+                    continue
+                near = maximize(posterior, start, steps=2)
+                evaluations += near.evaluations
+                if near.log_prob < floor:
+                    continue
+                start = near.params
+            again = maximize(posterior, start)
             evaluations += again.evaluations
             images = around.images(again.params)
             if again.distance < CLOSE and not around.among(images, modes):
                 found.append(again)
                 modes.append(images)
     best = max(found, key=lambda each: each.log_prob)
-    return ModeSearch(best, _mixture(posterior, found, draws), evaluations)
+    return ModeSearch(best, _mixture(posterior, found, draws, capped=capped), evaluations)
 
 
 class _Draws(NamedTuple):
@@ -190,9 +197,10 @@ class _Surroundings:
         places = self.inside[np.argsort(-self.worth[self.inside], kind="stable")]
         distance = np.hypot(*(expected - position[places[0]]).T)
         nearest = np.argsort(distance, kind="stable")
-        nearest = nearest[distance[nearest] < reach[nearest]][:MOST_ALIASES]
+        nearest = nearest[distance[nearest] < reach[nearest]]
+        least = HOPELESS - self.posterior.log_prior(self.top.params)[0]
         error = self.sigma * np.clip(1.0 / (1.0 + np.median(self.worth[places])), 1e-3, CENTROID)
-        for turn, source in itertools.product(TURNS, nearest):
+        for source, turn in itertools.product(nearest, TURNS):  # the most likely first
             shift = catalogue[places[0]] - turn @ catalogue[source]
             for some in (places[:64], places):  # few of many tell already
                 beside, other = tree.query((catalogue[some] - shift) @ turn)
@@ -208,8 +216,9 @@ class _Surroundings:
                 z, _ = field.fit(other[paired], position[some[paired]], error)
                 off = np.hypot(*(field.predict(z)[other] - position[some]).T)
                 lost = np.maximum(lost, self._lost(off))
-                if lost @ self.worth[some] < HOPELESS:
-                    yield self._with(z[None])[0]
+                params = self._with(z[None])
+                if lost @ self.worth[some] - self.posterior.log_prior(params)[0] < least:
+                    yield params[0]
 
     def draws(self) -> _Draws | None:
         """Draws of what the bright sources leave possible; None where that is this mode alone."""
@@ -250,7 +259,9 @@ class _Surroundings:
         return _Draws(params[order], log_mass[order], self._with(mean[None])[0], wide, self.columns)
 
 
-def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | None) -> Modes | None:
+def _mixture(
+    posterior: Posterior, found: list[NewtonResult], draws: _Draws | None, *, capped: bool
+) -> Modes | None:
     """The modes with any mass, and what there is between them; None where one mode is all."""
     low, high = posterior.support
     log_mass = []
@@ -259,6 +270,7 @@ def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | No
         within = ndtr((high - mode.params) / sd) - ndtr((low - mode.params) / sd)
         log_mass.append(mode.log_prob + _log_volume(mode.covariance) + np.log(within).sum())
     weights = np.exp(np.array(log_mass) - logsumexp(log_mass))
+    complete = not capped or bool(weights.min() < REST * weights.max())
     order = [k for k in np.argsort(-weights, kind="stable") if weights[k] > NEGLIGIBLE]
     means, covariances = [found[k].params for k in order], [found[k].covariance for k in order]
     weights = weights[order] / weights[order].sum()
@@ -271,7 +283,7 @@ def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | No
             weights = np.concatenate([(1.0 - share - WIDE) * weights, [share, WIDE]])
     if len(means) == 1:
         return None
-    return Modes(np.array(means), np.array(covariances), weights, len(order))
+    return Modes(np.array(means), np.array(covariances), weights, len(order), complete)
 
 
 def _log_volume(covariance: Floats) -> float:
