@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 
 def masked(seed: int, offset: float, *, jitter: float = 0.0) -> Posterior:
     """A regular mask, larger than the frame, that was shifted along x."""
-    grid, rng = SourceCatalog.grid(15, PITCH, 300.0), np.random.default_rng(seed)
+    grid, rng = SourceCatalog.grid(13, PITCH, 300.0), np.random.default_rng(seed)
     mask = SourceCatalog(
         grid.x + rng.normal(0.0, jitter, len(grid)),
         grid.y + rng.normal(0.0, jitter, len(grid)),
         grid.flux,
     )
-    return _posterior(mask, (offset, 0.0), 2.0, seed, (REACH, 1e-3), side=49, sigma=1.5)
+    return _posterior(mask, (offset, 0.0), 2.0, seed, (REACH, 1e-3), side=33, sigma=1.5)
 
 
 def faint(seed: int, *, sources: int = 4) -> Posterior:

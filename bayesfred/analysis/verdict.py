@@ -153,6 +153,7 @@ def judge_sampling(
     failures += _not_at_maximum(chain)
     if unmatched:
         failures.append(f"{unmatched}, so that other modes may have been missed")
+    failures += _incomplete(chain)
     if failures:
         return False, f"Not sampled well: {'; '.join(failures)}.{_several(chain)}"
     return True, (
@@ -174,7 +175,7 @@ def judge_approximation(chain: Chain, efficiency: float) -> str:
     -------
     str
     """
-    failures = _not_at_maximum(chain)
+    failures = _not_at_maximum(chain) + _incomplete(chain)
     if not efficiency >= MIN_EFFICIENCY:
         failures.append(
             f"the posterior is not normal (importance efficiency {efficiency:.0%} is below "
@@ -221,6 +222,12 @@ def _not_at_maximum(chain: Chain) -> list[str]:
     if chain.estimate.at_maximum:
         return []
     return [f"the MAP is not at the maximum ({chain.estimate.message})"]
+
+
+def _incomplete(chain: Chain) -> list[str]:
+    if chain.estimate.mixture.complete:
+        return []
+    return ["there are more modes than are searched for (narrow the prior of the offset)"]
 
 
 def _sum(fit: Mapping[str, float], name: str) -> str:

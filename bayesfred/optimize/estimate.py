@@ -26,12 +26,15 @@ class Modes:
         Share of the posterior's mass; they sum to 1.
     count : int
         Number of modes.
+    complete : bool
+        Whether all modes of any weight are among them: a search ends after a hundred aliases.
     """
 
     means: Floats
     covariances: Floats
     weights: Floats
     count: int
+    complete: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= len(self.weights) or not np.all(self.weights > 0.0):

@@ -1,4 +1,7 @@
-"""The posterior's maximum: `starts` says where to begin, `newton` maximises, here it is judged."""
+"""The posterior's maximum: `starts` says where to begin, `newton` maximises, here it is judged.
+
+`modes` looks for others beside the one that is found.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -38,6 +41,9 @@ def find_map(
     posterior: TargetDensity, start: Sequence[float] | Floats | None = None
 ) -> MapEstimate:
     """Maximise the posterior.
+
+    Where a frame may have several modes all are looked for, wherever the search begins; the highest
+    is the maximum.
 
     Parameters
     ----------

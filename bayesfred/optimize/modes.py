@@ -6,8 +6,8 @@ source's light is worth, in log-likelihood, is known at the maximum,
     w = (2 r - 1) (F S)^2 / 2 sd^2,
 
 with the matched filter's signal to noise F S / sd and the share r of the light that was found, see
-`matched`. At a distance d from its light a source loses w (1 - exp(-d^2 / 4 s^2)). Where all of
-them lose more than `HOPELESS` there is no mode of any mass. Two kinds of modes lose less.
+`matched`. At a distance d from its light a source loses w (1 - exp(-d^2 / 4 s^2)). No mode whose
+sources lose more than `HOPELESS` together has any mass. Two kinds of modes lose less.
 
 1. Aliases: sources take each other's places, as those of a regular mask do when it is shifted by a
    pitch or turned. Vectors that map the catalogue onto itself are found in the catalogue. The
@@ -22,7 +22,7 @@ mass too. The draws estimate it, and the normal distribution that they come from
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +40,9 @@ HOPELESS = 60.0  # in log-likelihood; noise makes up for 3 sqrt(2 HOPELESS) = 33
 NEGLIGIBLE = 1e-4  # share of the mass
 SAME = 0.7  # images are moved by more PSF widths than this between two modes
 DRAWS = 1024
-MOST = 24  # searches from aliases, and from draws
-MOST_ALIASES = 64  # sources that are tried in one place
+MOST, MOST_DRAWS = 24, 256  # searches from draws, and draws that they may begin at
+MOST_ALIASES = 100  # searches from aliases
+LAST, REST = 10, 1e-3  # the others do not matter if the last aliases have less weight than this
 BESIDE = 0.5  # PSF widths between a source and the one whose place it takes, at most
 LEAST_SHARE = 0.1  # of proposals between the modes
 WIDE = 0.1  # ... and of those that reach wherever the bright sources or the prior allow
@@ -90,30 +91,39 @@ def find_modes(posterior: Posterior, top: NewtonResult) -> ModeSearch:
     around = _Surroundings(posterior, top, light)
     draws = around.draws()
     found, evaluations = [top], 0 if draws is None else len(draws.params)
-    modes = [around.images(top.params)]
-    for starts in (around.aliases(), () if draws is None else draws.params):
+    modes, n_aliases = [around.images(top.params)], 0
+    some: Iterable[Floats] = () if draws is None else draws.params[:MOST_DRAWS]
+    floor = top.log_prob - HOPELESS
+    for starts, most in ((around.aliases(), MOST_ALIASES), (some, MOST)):
         tried: list[Floats] = []
         for start in starts:
             images = around.images(start)
-            if len(tried) == MOST or around.among(images, modes) or around.among(images, tried):
+            if around.among(images, modes) or around.among(images, tried):
                 continue
+            if len(tried) == most:
+                n_aliases = len(found) if most == MOST_ALIASES else n_aliases
+                break
             tried.append(images)
-            if not np.isfinite(posterior.log_prob(start)):
-                continue
-            near = maximize(posterior, start, steps=2)
-            evaluations += near.evaluations
-            if near.log_prob < top.log_prob - HOPELESS or around.among(
-                around.images(near.params), modes
-            ):
-                continue
-            again = maximize(posterior, near.params)
+            log_prob = float(posterior.log_prob(start))
+            if log_prob < floor:  # bright sources not quite in place
+                if not np.isfinite(log_prob):
+                    continue
+                near = maximize(posterior, start, steps=2)
+                evaluations += near.evaluations
+                if near.log_prob < floor:
+                    continue
+                start = near.params
+            again = maximize(posterior, start)
             evaluations += again.evaluations
             images = around.images(again.params)
             if again.distance < CLOSE and not around.among(images, modes):
                 found.append(again)
                 modes.append(images)
     best = max(found, key=lambda each: each.log_prob)
-    return ModeSearch(best, _mixture(posterior, found, draws), evaluations)
+    log_mass = _laplace_masses(posterior, found)
+    last = log_mass[:n_aliases][-LAST:]
+    complete = bool(np.all(np.exp(last - log_mass.max()) < REST))
+    return ModeSearch(best, _mixture(found, log_mass, draws, complete=complete), evaluations)
 
 
 class _Draws(NamedTuple):
@@ -188,12 +198,15 @@ class _Surroundings:
         expected = field.predict(field.centre)
         reach = GATE * field.spread(field.everyone, expected, np.diag(field.scale**2))
         places = self.inside[np.argsort(-self.worth[self.inside], kind="stable")]
-        distance = np.hypot(*(expected - position[places[0]]).T)
+        bright = places[self.worth[places] >= 0.5 * self.worth[places[0]]]
+        middle = bright[np.argmin(np.hypot(*position[bright].T))]
+        distance = np.hypot(*(expected - position[middle]).T)
         nearest = np.argsort(distance, kind="stable")
-        nearest = nearest[distance[nearest] < reach[nearest]][:MOST_ALIASES]
-        error = self.sigma * np.clip(1.0 / (1.0 + np.median(self.worth[places])), 1e-3, CENTROID)
-        for turn, source in itertools.product(TURNS, nearest):
-            shift = catalogue[places[0]] - turn @ catalogue[source]
+        nearest = nearest[distance[nearest] < reach[nearest]]
+        least = HOPELESS - self.posterior.log_prior(self.top.params)[0]
+        error = self.sigma * min(CENTROID, (1.0 + 2.0 * np.median(self.worth[places])) ** -0.5)
+        for source, turn in itertools.product(nearest, TURNS):  # the most likely first
+            shift = catalogue[middle] - turn @ catalogue[source]
             for some in (places[:64], places):  # few of many tell already
                 beside, other = tree.query((catalogue[some] - shift) @ turn)
                 far = np.hypot(*(position[some] - expected[other]).T) > reach[other]
@@ -208,8 +221,9 @@ class _Surroundings:
                 z, _ = field.fit(other[paired], position[some[paired]], error)
                 off = np.hypot(*(field.predict(z)[other] - position[some]).T)
                 lost = np.maximum(lost, self._lost(off))
-                if lost @ self.worth[some] < HOPELESS:
-                    yield self._with(z[None])[0]
+                params = self._with(z[None])
+                if lost @ self.worth[some] - self.posterior.log_prior(params)[0] < least:
+                    yield params[0]
 
     def draws(self) -> _Draws | None:
         """Draws of what the bright sources leave possible; None where that is this mode alone."""
@@ -250,15 +264,22 @@ class _Surroundings:
         return _Draws(params[order], log_mass[order], self._with(mean[None])[0], wide, self.columns)
 
 
-def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | None) -> Modes | None:
-    """The modes with any mass, and what there is between them; None where one mode is all."""
+def _laplace_masses(posterior: Posterior, found: list[NewtonResult]) -> Floats:
+    """The log masses of modes, as far as the prior's support holds them."""
     low, high = posterior.support
     log_mass = []
     for mode in found:
         sd = np.sqrt(np.diag(mode.covariance))
         within = ndtr((high - mode.params) / sd) - ndtr((low - mode.params) / sd)
         log_mass.append(mode.log_prob + _log_volume(mode.covariance) + np.log(within).sum())
-    weights = np.exp(np.array(log_mass) - logsumexp(log_mass))
+    return np.array(log_mass)
+
+
+def _mixture(
+    found: list[NewtonResult], log_mass: Floats, draws: _Draws | None, *, complete: bool
+) -> Modes | None:
+    """The modes with any mass, and what there is between them; None where one mode is all."""
+    weights = np.exp(log_mass - logsumexp(log_mass))
     order = [k for k in np.argsort(-weights, kind="stable") if weights[k] > NEGLIGIBLE]
     means, covariances = [found[k].params for k in order], [found[k].covariance for k in order]
     weights = weights[order] / weights[order].sum()
@@ -271,7 +292,7 @@ def _mixture(posterior: Posterior, found: list[NewtonResult], draws: _Draws | No
             weights = np.concatenate([(1.0 - share - WIDE) * weights, [share, WIDE]])
     if len(means) == 1:
         return None
-    return Modes(np.array(means), np.array(covariances), weights, len(order))
+    return Modes(np.array(means), np.array(covariances), weights, len(order), complete)
 
 
 def _log_volume(covariance: Floats) -> float:

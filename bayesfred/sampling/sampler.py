@@ -1,11 +1,12 @@
 """Sampling: independent emcee ensembles, run side by side until their draws suffice.
 
-Every ensemble starts from draws of the Laplace approximation and moves by `LaplaceMove`, now and
-then by differential evolution. Where too few moves are accepted the proposals are adapted to the
-draws so far, which are then left out, see `ensembles`. After growing numbers of steps R-hat between
-the ensembles and the effective sample sizes are computed; the run ends when they meet the target,
-see `stopping`. The chain stays in memory. With a path, `checkpoints` also saves it to a file every
-half minute and at the end, so that a run that was stopped can be resumed.
+Every ensemble starts from draws of the Laplace approximation, of several modes each in another, and
+moves by `LaplaceMove`, now and then by differential evolution. Where too few moves are accepted the
+proposals are adapted to the draws so far, which are then left out, see `ensembles`. After growing
+numbers of steps R-hat between the ensembles and the effective sample sizes are computed; the run
+ends when they meet the target, see `stopping`. The chain stays in memory. With a path,
+`checkpoints` also saves it to a file every half minute and at the end, so that a run that was
+stopped can be resumed.
 """
 
 import math
