@@ -21,8 +21,8 @@ from h5py import h5a, h5d, h5l, h5o, h5t, h5z
 from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
-SCHEMA = 4
-READABLE = (3, 4)  # schema 3 means the shifted Poisson by read noise; see `sampling/chainfile`
+SCHEMA = 5
+READABLE = (3, 4, 5)  # not all that it may hold; see `sampling/chainfile`
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 

@@ -48,6 +48,8 @@ from bayesfred.model.parameters import (
 )
 from bayesfred.model.threads import share
 
+BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
+
 
 @dataclass(frozen=True, eq=False)
 class FrameLikelihood:
@@ -210,9 +212,9 @@ class FrameLikelihood:
             image, or expected counts are negative.
         """
         theta, nuisances, background = self._one(params)
-        flux = nuisances.flux_scale * self._flux
+        flux, shape = nuisances.flux_scale * self._flux, self.nuisances.flux_shape
         if self._free:
-            flux = self._flux * rng.gamma(2.0, 0.5, self._flux.size)
+            flux = self._flux * rng.gamma(shape, 1.0 / shape, self._flux.size)
         ny, nx = self.model.detector.shape
         optics, out = self._optics, np.zeros(ny * stride(nx))
         at_rest = nuisances._replace(position_scatter=0.0)
@@ -342,8 +344,17 @@ class FrameLikelihood:
         return True if self.nuisances.flux == "free" else None  # code for None is not compiled
 
     @cached_property
+    def _faint(self) -> Flags:
+        """Sources of fewer than `BRIGHT` standard deviations, by the catalogue and the frame."""
+        counts = np.maximum(self.counts, 0.0)
+        variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
+        area = 4.0 * np.pi * (self.model.psf.sigma / self.model.detector.binning) ** 2
+        return self._flux**2 < BRIGHT**2 * (self._flux + area * variance)
+
+    @cached_property
     def _problem(self) -> Problem:
-        return Problem(self._optics, self._frame, self._flux, self._free)
+        shape = self.nuisances.flux_shape
+        return Problem(self._optics, self._frame, self._flux, shape, self._faint, self._free)
 
     @cached_property
     def _frame(self) -> Frame:
