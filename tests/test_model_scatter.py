@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from oracles import next_term
 from scipy import optimize, stats
 from test_model import LIMIT, Noise, background_image, dense_image, known, make_model, make_truth
 from test_model_derivatives import STEP, errors, five_point, joint
@@ -135,9 +136,13 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     steps = np.append(1e-3 * phi[:n], np.full(2 * n, 1e-2))
     slopes = np.stack([five_point(mean, phi, k, steps[k]) for k in range(3 * n)])
     h = (slopes * posterior.counts.ravel() / mean(phi) ** 2) @ slopes.T + np.diag(
-        np.append(phi[:n] ** -2, np.full(2 * n, tau**-2))
+        np.append(2 * phi[:n] ** -2, np.full(2 * n, tau**-2))
     )
     expected = value(found.x) + 1.5 * n * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(h)[1]
+    expected -= found.x[:n].sum()  # the density is that of log F, H that in F
+    stamps, at = templates(phi), mean(phi)
+    counts = posterior.counts.ravel()
+    expected += next_term(phi[:n, None] * stamps, counts / at**2, counts / at**3, 2.0)
     assert posterior.fluxes(params) == pytest.approx(phi[:n], rel=1e-4)
     assert posterior.log_prob(params) - posterior.log_prior(params)[0] == pytest.approx(
         expected, abs=1e-5
@@ -161,7 +166,7 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     outer = np.stack([five_point(image, params, i, STEP * scale[i]) for i in others])
     weight = 1 / mean(phi)
     inner = (slopes * weight) @ slopes.T
-    h = inner + np.diag(np.append(phi[:n] ** -2, np.full(2 * n, tau**-2)))
+    h = inner + np.diag(np.append(2 * phi[:n] ** -2, np.full(2 * n, tau**-2)))
     cross = (outer * weight) @ slopes.T
     schur = (outer * weight) @ outer.T - cross @ np.linalg.solve(h, cross.T)
     fisher = posterior.fisher(params)
@@ -170,7 +175,7 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
         schur * both[np.ix_(others, others)], abs=1e-4
     )
     measured = inner.copy()
-    measured[:n, :n] += np.diag(phi[:n] ** -2)
+    measured[:n, :n] += np.diag(2 * phi[:n] ** -2)
     if (
         case == "bright"
     ):  # a source's two coordinates are nearly independent: each alone tells of the scatter

@@ -57,7 +57,7 @@ def absorbed(
     response, free = responses(posterior, params, fits), posterior.nuisances.profiled
     alone = np.zeros((fits.fluxes.size, 4, 4))
     if free:
-        prior = np.ones(free)  # of a relative flux; Gamma(2) adds 1 / F^2
+        prior = np.full(free, posterior.nuisances.flux_shape)  # of a relative flux
         if free > 1:
             scatter = params[posterior.parameter_names.index("position_scatter")]
             prior[1:] = scatter**-2.0

@@ -22,8 +22,7 @@ from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
 SCHEMA = 5
-# schema 3 means the shifted Poisson by read noise, see `sampling/chainfile`; 3 and 4 have one mode
-READABLE = (3, 4, 5)
+READABLE = (3, 4, 5)  # not all that it may hold; see `sampling/chainfile`
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 

@@ -13,8 +13,9 @@ frozen distribution of `scipy.stats`       a group of kind `distribution`: `fami
 =========================================  =====================================================
 
 A field declared with `field(metadata={"stored": False})` is not stored: its constructor supplies
-it. Nothing is pickled, and reading makes objects of registered classes only, through their
-constructors, which check what they are given.
+it. One with `metadata={"since": 5}` takes its default from files of a schema before 5. Nothing is
+pickled, and reading makes objects of registered classes only, through their constructors, which
+check what they are given.
 """
 
 import inspect
@@ -268,7 +269,9 @@ def _get_group(group: Any) -> Any:
             f"{group.name}: got the unknown kind {kind!r}, expected one of {known}: import the "
             "module that defines it, or restore a copy"
         )
-    values = {name: _get(group, name) for name in _stored(cls)}
+    held = {*group.attrs, *group}
+    later = {f.name for f in fields(cls) if "since" in f.metadata} - held  # they have a default
+    values = {name: _get(group, name) for name in _stored(cls) if name not in later}
     for name, hint in _hints(cls).items():
         if name in values and not _fits(values[name], hint):
             wanted = getattr(hint, "__name__", str(hint))

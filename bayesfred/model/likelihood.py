@@ -49,6 +49,8 @@ from bayesfred.model.parameters import (
 )
 from bayesfred.model.threads import share
 
+BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
+
 
 @dataclass(frozen=True, eq=False)
 class FrameLikelihood:
@@ -203,7 +205,8 @@ class FrameLikelihood:
 
     def flux_prior(self, which: int | slice = slice(None)) -> Any:
         """The prior of the fluxes of some sources, where they are free, counts."""
-        return stats.gamma(2.0, scale=0.5 * self._flux[which])
+        shape = self.nuisances.flux_shape
+        return stats.gamma(shape, scale=self._flux[which] / shape)
 
     def simulate(
         self, params: Floats, rng: np.random.Generator, fluxes: Floats | None = None
@@ -351,8 +354,17 @@ class FrameLikelihood:
         return True if self.nuisances.flux == "free" else None  # code for None is not compiled
 
     @cached_property
+    def _faint(self) -> Flags:
+        """Sources of fewer than `BRIGHT` standard deviations, by the catalogue and the frame."""
+        counts = np.maximum(self.counts, 0.0)
+        variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
+        area = 4.0 * np.pi * (self.model.psf.sigma / self.model.detector.binning) ** 2
+        return self._flux**2 < BRIGHT**2 * (self._flux + area * variance)
+
+    @cached_property
     def _problem(self) -> Problem:
-        return Problem(self._optics, self._frame, self._flux, self._free)
+        shape = self.nuisances.flux_shape
+        return Problem(self._optics, self._frame, self._flux, shape, self._faint, self._free)
 
     @cached_property
     def _frame(self) -> Frame:

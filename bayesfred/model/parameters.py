@@ -7,7 +7,7 @@ row of `SOURCE_NUISANCES` and a field of the kernels' `Nuisance` tuple.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -19,6 +19,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.io.serialize import serializable
 
 FluxMode = Literal["fixed", "scale", "free"]
+LEAST_SHAPE = 0.5  # of a Gamma prior; the integral over fluxes is expanded in its inverse
 
 
 @serializable("nuisances")
@@ -30,8 +31,8 @@ class Nuisances:
     ----------
     flux : {"fixed", "scale", "free"}
         Catalogue fluxes are exact; or right but for a common factor, the parameter `flux_scale`; or
-        each is free. Free fluxes are not sampled: the likelihood takes its maximum over them, with
-        the Laplace term, under a prior Gamma(2) whose mean is the catalogue's flux.
+        each is free. Free fluxes are not sampled: the likelihood is integrated over them, under a
+        Gamma prior whose mean is the catalogue's flux; see `model/kernels/expansion.py`.
     offset : bool
         Whether the pointing is unknown: parameters `offset_x`, `offset_y`, pixel, added to every
         source's position.
@@ -49,6 +50,10 @@ class Nuisances:
         Whether the sources lie off their catalogue positions, by normal errors of unknown standard
         deviation along each axis: parameter `position_scatter`, pixel, as imaged. Needs free
         fluxes. Like these, the shifts are not sampled.
+    flux_shape : float
+        Shape of the free fluxes' Gamma prior, which has the relative standard deviation
+        1/sqrt(flux_shape): 2, the default, says little, 25 that the catalogue's fluxes are right to
+        20 %.
 
     Raises
     ------
@@ -67,6 +72,7 @@ class Nuisances:
     background_order: int = 0
     footprint: float | None = None
     position_scatter: bool = False
+    flux_shape: float = field(default=2.0, metadata={"since": 5})
 
     def __post_init__(self) -> None:
         if self.flux not in get_args(FluxMode):
@@ -84,6 +90,10 @@ class Nuisances:
             raise InputError(
                 f"nuisances: position_scatter: got it with {self.flux} fluxes, expected free ones: "
                 "set flux to free"
+            )
+        if not (np.isfinite(self.flux_shape) and self.flux_shape >= LEAST_SHAPE):
+            raise InputError(
+                f"nuisances: flux_shape: got {self.flux_shape}, expected a number >= {LEAST_SHAPE}"
             )
 
     @property

@@ -260,7 +260,10 @@ class Posterior(TargetDensity):
         return np.sqrt(self.noise.counts_variance(self.expected_counts(params), level))
 
     def fluxes(self, params: npt.ArrayLike) -> Floats:
-        """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
+        """Flux of every source, counts: the catalogue's, scaled, or the most likely ones.
+
+        Free fluxes are those at which the density of their logarithms is highest.
+        """
         return self.likelihood.fluxes(self._vector(params))
 
     @cached_property

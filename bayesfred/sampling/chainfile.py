@@ -142,23 +142,30 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
         write_array(group, name, values)
 
 
-def _refuse_shifted_poisson(file: h5py.File) -> None:
-    """Raise InputError for a chain whose read noise is the shifted Poisson of schema 3.
+def _refuse_other_densities(file: h5py.File) -> None:
+    """Raise InputError for a chain whose log-probabilities are not those of what would be read.
 
-    Its log-probabilities are those of another model than the one that would be read.
+    Read noise was a shifted Poisson distribution in schema 3, and free fluxes had Laplace's
+    approximation alone before schema 5.
     """
+    schema = file.attrs["schema"]
+    if file["posterior/nuisances"].attrs["flux"] == b"free" and schema < 5:
+        raise InputError(
+            f"nuisances: got free fluxes by Laplace's approximation (schema {schema}), expected "
+            "the integral over them that has replaced it: sample the frame again"
+        )
     noise = file["posterior/noise"].attrs
     shifted = noise["kind"] == b"noise.poisson" and noise.get("read_noise", 0.0) > 0.0
-    if shifted and file.attrs["schema"] < 4:
+    if shifted and schema < 4:
         raise InputError(
             f"noise: got read noise {noise['read_noise']:g} as the shifted Poisson distribution "
-            f"(schema {file.attrs['schema']}), expected the convolution with a Gaussian that has "
+            f"(schema {schema}), expected the convolution with a Gaussian that has "
             "replaced it: sample the frame again"
         )
 
 
 def _read(path: Path, file: h5py.File) -> Chain:
-    _refuse_shifted_poisson(file)
+    _refuse_other_densities(file)
     modes = read(file["modes"], Modes) if "modes" in file else None
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     chain = Chain(

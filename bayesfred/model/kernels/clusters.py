@@ -193,11 +193,11 @@ def gram(touching, group, weight, at, out):
 
 
 @inner()
-def add_prior(h, group, size, fluxes, scatter):
-    """Add the priors' curvature to H: 1/F^2 for a flux, 1/tau^2 for a shift."""
+def add_prior(h, group, size, fluxes, shape, scatter):
+    """Add the priors' curvature to H: a/F^2 for a flux, 1/tau^2 for a shift."""
     for i in range(group.lead.size):
         flux = fluxes[group.members[i // size]]
-        h[group.start[i] + i] += 1.0 / flux**2 if i % size == 0 else 1.0 / scatter**2
+        h[group.start[i] + i] += shape / flux**2 if i % size == 0 else 1.0 / scatter**2
 
 
 @inner()

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba.extending import register_jitable
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.kernels.contexts import Footprints, Geometry, Optics, SourceNuisances
 
 Bytes = npt.NDArray[np.uint8]
@@ -39,6 +39,8 @@ class Problem(NamedTuple):
     optics: Optics
     frame: Frame
     flux: Floats  # (s,) of the catalogue, counts
+    shape: float  # of the fluxes' Gamma prior
+    faint: Flags  # (s,) sources for which the term of `expansion.py` counts
     # None where fluxes are fixed: a type of its own, for which what profiles them is not compiled
     free: Literal[True] | None
 
@@ -51,6 +53,7 @@ class Workspace(NamedTuple):
     span: Ints  # (ny, 2) first and last marked segment of a row
     score: Floats  # (ny * stride,) scratch
     weight: Floats
+    ratio: Floats
     # what profiling fills again on every call, kept because new memory costs more than its use
     heap: Floats
 
@@ -101,6 +104,7 @@ class Touching(NamedTuple):
     boxes: Ints  # (s, 4) first row, last row + 1, first column, last column + 1
     clusters: Clusters
     stamps: Floats  # (templates, samples)
+    faint: Flags  # (s,) that of `Problem`
 
 
 class Profiled(NamedTuple):
@@ -109,6 +113,7 @@ class Profiled(NamedTuple):
     touching: Touching
     factors: Floats  # Cholesky factors of H
     shifts: Floats  # (s, 2) pixel
+    shape: float  # of the fluxes' Gamma prior
 
 
 class Rendered(NamedTuple):

@@ -33,8 +33,9 @@ def _fill_fluxes(problem, layout, w, parameters, fluxes, free):
     boxes = bounding_boxes(fp)
     clusters = find_clusters(boxes, o.ny, templates)
     stamps = room(w, w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
-    touching = Touching(fp, boxes, clusters, stamps)
-    profiled = Profiled(touching, np.empty(clusters.begin[-1]), np.zeros((fluxes.size, 2)))
+    touching = Touching(fp, boxes, clusters, stamps, problem.faint)
+    factors, shifts = np.empty(clusters.begin[-1]), np.zeros((fluxes.size, 2))
+    profiled = Profiled(touching, factors, shifts, problem.shape)
     return profile(problem, layout, w, parameters, profiled, fluxes), profiled
 
 

@@ -11,7 +11,8 @@ and 1/2 log det H differs from its value at the maximum by sum_s b_s d_s + O(d^2
 than one or so: on a source's pixels mu changes by no more than d_s mu, and H by twice as much. b is
 known from other parameters nearby; it is -F e with the e of `gradient.py`, which is H z. Where D =
 sum_s |d_s| is little, the pixels need to be visited once. They are visited in bands of rows, whose
-templates stay in the caches while they are rendered, weighed and multiplied.
+templates stay in the caches while they are rendered, weighed and multiplied. The term c of
+`expansion.py` is that of F: it changes by less than d.
 """
 
 import math
@@ -19,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
@@ -27,13 +28,13 @@ from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, ro
 from bayesfred.imaging.kernels.render import add_source
 from bayesfred.model.kernels.clusters import bounding_boxes, cholesky, one_cluster, solve
 from bayesfred.model.kernels.contexts import Clusters
+from bayesfred.model.kernels.expansion import OVERLAP, own_run, pair, shared_run, single
 from bayesfred.model.kernels.likelihood import U, log_likelihood, mark, room, weigh_rows
 from bayesfred.model.kernels.noise_dispatch import at_level
 
 BAND = 16  # rows visited at a time
 VISITS = 3  # of all pixels, after which the fluxes count as not known beforehand
 ENOUGH = 5e-5  # the largest D
-OVERLAP = 1e-4  # the least |H_st| / sqrt(H_ss H_tt) that counts: log det H changes by its square
 
 
 class Extrapolated(NamedTuple):
@@ -59,6 +60,9 @@ class _Visit(NamedTuple):
     known: Extrapolated
     g: Floats
     h: Floats
+    faint: Flags  # (s,) that of `Problem`
+    own: Floats  # (s, 3) N of `expansion.py`, zero unless faint
+    mixed: Floats  # (pairs, 6)
 
 
 @entry()
@@ -119,22 +123,29 @@ def _multiply_band(w, visit, top, last):
     """Add what a band's pixels give to g and H."""
     fp, boxes, known, h = visit.layout.footprints, visit.boxes, visit.known, visit.h
     templates, place, at = visit.templates.image, visit.templates.at, visit.canvas.at
-    low, size, score, weight = fp.low, fp.size, w.score, w.weight
+    low, size, score, weight, ratio = fp.low, fp.size, w.score, w.weight, w.ratio
     for s in range(visit.g.size):
         begin, end = max(top, boxes[s, 0]), min(last, boxes[s, 1])
         if begin >= end:
             continue
         own = fp.first[s] - boxes[s, 0]
-        square = 0.0
+        square, sums = 0.0, (0.0, 0.0, 0.0)
         for p in range(own + begin, own + end):
-            g_row, h_row = _own_row(templates, U(place[p]), score, weight, U(at[p]), U(size[p]))
+            i, k, n = place[p], at[p], size[p]
+            g_row, h_row = _own_row(templates, U(i), score, weight, U(k), U(n))
             visit.g[s] += g_row
             square += h_row
+            if visit.faint[s]:
+                here = slice(k, k + n)
+                sums = own_run(templates[i : i + n], weight[here], ratio[here], sums)
         h[known.diagonal[s]] += square
+        for m in range(3):
+            visit.own[s, m] += sums[m]
         for e in range(known.first[s], known.last[s]):
             t = known.other[e]
             others = fp.first[t] - boxes[t, 0]
-            total = 0.0
+            total, products = 0.0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            both = visit.faint[s] and visit.faint[t]
             for j in range(max(begin, boxes[t, 0]), min(end, boxes[t, 1])):
                 p, q = own + j, others + j
                 a = max(low[p], low[q])
@@ -142,7 +153,13 @@ def _multiply_band(w, visit, top, last):
                 if n > 0:
                     i, m, k = place[p] + a - low[p], place[q] + a - low[q], at[p] + a - low[p]
                     total += _shared_row(templates, U(i), U(m), weight, U(k), U(n))
+                    if both:
+                        left, right = templates[i : i + n], templates[m : m + n]
+                        here = slice(k, k + n)
+                        products = shared_run(left, right, weight[here], ratio[here], products)
             h[known.place[e]] += total
+            for m in range(6):
+                visit.mixed[e, m] += products[m]
 
 
 @inner()
@@ -151,7 +168,10 @@ def _sum_up(frame, w, background, visit, fluxes):
     layout, boxes, place = visit.layout, visit.boxes, visit.templates.at
     fp, noise = layout.footprints, at_level(frame.noise, background[0])
     visit.g[:] = 0.0
+    expanded = np.any(visit.faint)
     visit.h[:] = 0.0
+    visit.own[:] = 0.0
+    visit.mixed[:] = 0.0
     for top in range(0, frame.ny, BAND):
         last = min(top + BAND, frame.ny)
         used = 0
@@ -164,34 +184,52 @@ def _sum_up(frame, w, background, visit, fluxes):
                 place[i] = used + fp.start[i] - fp.start[p]
             used += fp.start[q] - fp.start[p]
             add_source(layout, s, (p, q), fluxes[s], visit.canvas, visit.templates)
-        weigh_rows(frame, noise, w, background, top, last)
+        weigh_rows(frame, noise, w, background, (top, last), expanded)
         _multiply_band(w, visit, top, last)
 
 
 @inner()
-def _newton(visit, clusters, scale, fluxes):
+def _newton(visit, clusters, shape, scale, fluxes):
     """One Newton step of the fluxes; returns the extrapolated terms and D, NaN if it fails."""
     value, change = 0.0, 0.0
+    constant = 0.5 * math.log(2.0 * math.pi) - math.lgamma(shape)
     for c in range(clusters.first.size - 1):
         group = one_cluster(clusters, c, 1)
         lower, start = visit.h[clusters.begin[c] : clusters.begin[c + 1]], group.start
         step = np.empty(group.members.size)
         for i in range(step.size):
             s = group.members[i]
-            lower[start[i] + i] += 1.0
-            visit.g[s] += 1.0 - fluxes[s] / scale[s]
+            lower[start[i] + i] += shape
+            visit.g[s] += shape - fluxes[s] / scale[s]
             step[i] = visit.g[s]
         if not cholesky(lower, group):
             return math.nan, math.nan
         solve(lower, group, step)
         for i in range(step.size):
             s = group.members[i]
-            value += 2.0 * math.log(fluxes[s] / scale[s]) - fluxes[s] / scale[s]
-            value += 0.5 * math.log(2.0 * math.pi) - math.log(lower[start[i] + i])
+            value += shape * math.log(fluxes[s] / scale[s]) - fluxes[s] / scale[s]
+            value += constant - math.log(lower[start[i] + i])
             value += (0.5 * visit.g[s] - visit.known.slope[s]) * step[i]
             change += abs(step[i])
             fluxes[s] *= 1.0 + step[i]
     return value, change
+
+
+@inner()
+def _next_term(visit, shape):
+    """The sum of c of `expansion.py`."""
+    known, own, mixed, slopes = visit.known, visit.own, visit.mixed, np.empty(12)
+    alone, value = np.zeros(visit.g.size), 0.0
+    for s in range(alone.size):
+        if visit.faint[s]:
+            alone[s] = single(own[s], shape, slopes)
+            value += alone[s]
+    for s in range(alone.size):
+        for e in range(known.first[s], known.last[s]):
+            t = known.other[e]
+            if visit.faint[s] and visit.faint[t]:
+                value += pair(own[s], own[t], mixed[e], shape, slopes) - alone[s] - alone[t]
+    return value
 
 
 @inner()
@@ -217,13 +255,18 @@ def profile_extrapolated(problem, w, parameters, fluxes, known):
         known,
         np.empty(fluxes.size),
         np.empty(clusters.begin[-1]),
+        problem.faint,
+        np.empty((fluxes.size, 3)),
+        np.empty((known.other.size, 6)),
     )
+    scale = problem.flux / problem.shape
     for i in range(VISITS):
         if i > 0:
             w.image[:] = 0.0
         _sum_up(frame, w, parameters.background, visit, fluxes)
-        value, change = _newton(visit, clusters, 0.5 * problem.flux, fluxes)
+        value, change = _newton(visit, clusters, problem.shape, scale, fluxes)
         if change < ENOUGH:
+            value += _next_term(visit, problem.shape)
             return value + log_likelihood(frame, w, parameters.background)
         if not (change < 0.5 * fluxes.size and np.min(fluxes) > 0.0):
             break

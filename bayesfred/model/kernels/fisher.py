@@ -132,7 +132,7 @@ def _subtract_profiled(w, rendered, profiled, scatter, cross, out):
             members, column = group.members, np.empty(group.lead.size)
             h = profiled.factors[clusters.begin[c] : clusters.begin[c + 1]]
             gram(touching, group, w.weight, at, h)
-            add_prior(h, group, templates, rendered.fluxes, scatter)
+            add_prior(h, group, templates, rendered.fluxes, profiled.shape, scatter)
             cholesky(h, group)  # positive definite: the prior's curvature is
             known += _known_scatter(h, group, templates, scatter)
             for m in range(out.shape[0]):

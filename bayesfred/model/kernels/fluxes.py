@@ -1,20 +1,25 @@
 """Fluxes and positions at their maximum, where these are free.
 
 Free fluxes. Given everything else the expected counts mu = B + sum_s F_s K_s are linear in the
-fluxes F, and with the prior F_s ~ Gamma(2, scale c_s/2) the log-posterior in F is concave wherever
-the log-density of counts is concave in mu: for Poisson counts a sum of n log(mu), log(F) and linear
-terms. Along a Newton step let d be the largest relative change of any of these mu and F. A fraction
-t < 1/d of the step raises the second derivative by no more than 1/(1 - t d)^2, so the gain is
-largest, for certain, at t = 1/(1 + d): mu and F stay positive, the iteration converges from any
-start, and quadratically as d vanishes. With H minus the Hessian at the maximum,
+fluxes F, and the prior is F_s ~ Gamma(a, scale c_s/a). What is integrated over is log F, whose
+density is F times that of F: it is nearer to a normal one, and no F > 0 is out of its reach. With
+log p(log F) = a log F - a F/c, log L + log p is concave in F wherever the log-density of counts is
+concave in mu: for Poisson counts a sum of n log(mu), log(F) and linear terms. Along a Newton step
+let d be the largest relative change of any of these mu and F. A fraction t < 1/d of the step raises
+the second derivative by no more than 1/(1 - t d)^2, so the gain is largest, for certain, at t =
+1/(1 + d): mu and F stay positive, the iteration converges from any start, and quadratically as d
+vanishes. With H minus the Hessian in F at the maximum, that in log F
+being F_s H_st F_t there,
 
-    log L(theta) = max_F [log L(theta, F) + log p(F)] + n_s/2 log(2 pi) - 1/2 log det H
-    (Laplace)
+    log L(theta) = max_F [log L(theta, F) + log p(log F)] + n_s/2 log(2 pi) - 1/2 log det H
+                   - sum_s log F_s + c,
+
+Laplace's approximation and the next term, see `expansion.py`.
 
 Free positions. Where the catalogue's positions scatter, every source has three free numbers phi =
 (F, dx, dy), the shifts dx and dy of a and b having the prior N(0, tau^2), and three templates T = d
 mu/d phi: K, F X and F Y with X = dK/d dx, Y = dK/d dy, rebuilt as the source moves. H = sum_p W T
-T^T + diag(1/F^2, 1/tau^2, 1/tau^2), W = -d^2 log L/d mu^2, leaves out the second derivatives, which
+T^T + diag(a/F^2, 1/tau^2, 1/tau^2), W = -d^2 log L/d mu^2, leaves out the second derivatives, which
 it weighs with residuals of mean zero; that makes it positive definite anywhere.
 """
 
@@ -41,6 +46,7 @@ from bayesfred.model.kernels.clusters import (
     squared,
 )
 from bayesfred.model.kernels.contexts import Group, Touching
+from bayesfred.model.kernels.expansion import Pixels, expand
 from bayesfred.model.kernels.noise_dispatch import at_level
 from bayesfred.model.kernels.patches import Patch, fill_excess, new_patch, weigh_patch
 
@@ -55,7 +61,8 @@ class _Cluster(NamedTuple):
     canvas: Canvas  # the patch's image
     fluxes: Floats
     shifts: Floats
-    scale: Floats  # of the fluxes' prior Gamma(2, scale), density F exp(-F / scale) / scale^2
+    shape: float  # of the fluxes' Gamma prior
+    scale: Floats  # and its scale, the catalogue's flux over the shape
     scatter: float
 
 
@@ -100,7 +107,7 @@ def _fill_gradient(cluster, out):
         s, t = members[i // size], i % size
         out[i] = project(fp, s, stamps[t], cluster.patch.score, cluster.canvas.at)
         if t == 0:
-            out[i] += 1.0 / cluster.fluxes[s] - 1.0 / cluster.scale[s]
+            out[i] += cluster.shape / cluster.fluxes[s] - 1.0 / cluster.scale[s]
         else:
             out[i] -= cluster.shifts[s, t - 1] / cluster.scatter**2
 
@@ -179,11 +186,11 @@ def _maximize(frame, background, cluster, h):
     step, lower = np.empty(group.lead.size), h.copy() if size > 1 else h
     distance, rate, converged = 0.0, 1.0, False
     for _ in range(100):
-        weigh_patch(frame, noise, background, patch)
+        weigh_patch(frame, noise, background, patch, None)
         fresh = converged or rate > 0.01  # otherwise the last matrix serves
         if fresh:
             gram(touching, group, patch.weight, at, h)
-            add_prior(h, group, size, cluster.fluxes, cluster.scatter)
+            add_prior(h, group, size, cluster.fluxes, cluster.shape, cluster.scatter)
         if converged:
             return cholesky(h, group)
         _fill_gradient(cluster, step)
@@ -206,30 +213,38 @@ def _maximize(frame, background, cluster, h):
 def profile(problem, layout, w, parameters, profiled, fluxes):
     """Fill the fluxes and `profiled` with their maximum; add the sources to the image.
 
-    Returns the log-prior of the fluxes and shifts plus the Laplace term, or -inf without a maximum.
+    Returns what the integral over them adds to the log-likelihood, or -inf without a maximum.
     With three templates the shifts are free, and `layout` is left with the shifted sources.
     """
     touching, factors, shifts = profiled.touching, profiled.factors, profiled.shifts
     fp, clusters, size = layout.footprints, touching.clusters, touching.stamps.shape[0]
     at, frame = np.empty(fp.row.size, np.int64), row_starts(fp, w.image.size // w.span.shape[0])
-    scale, scatter = 0.5 * problem.flux, parameters.nuisances.position_scatter
-    value = 0.0
+    shape, scatter = problem.shape, parameters.nuisances.position_scatter
+    scale, value = problem.flux / shape, 0.0
+    constant = 0.5 * math.log(2.0 * math.pi) - math.lgamma(shape)
     shifts[:] = 0.0
     for c in range(clusters.first.size - 1):
         group = one_cluster(clusters, c, size)
         h = factors[clusters.begin[c] : clusters.begin[c + 1]]
         patch = new_patch(w, touching, group, at)
         canvas = Canvas(patch.image, at)
-        cluster = _Cluster(layout, touching, group, patch, canvas, fluxes, shifts, scale, scatter)
+        cluster = _Cluster(
+            layout, touching, group, patch, canvas, fluxes, shifts, shape, scale, scatter
+        )
         fill_excess(problem.frame, parameters.background, patch)
         _start(cluster)
         if not _maximize(problem.frame, parameters.background, cluster, h):
             return -math.inf
+        if np.any(touching.faint[group.members]):
+            noise = at_level(problem.frame.noise, parameters.background[0])
+            weigh_patch(problem.frame, noise, parameters.background, patch, patch.ratio)
+            pixels = Pixels(patch.weight, patch.ratio, at)
+            value += expand(touching, group, fluxes, shape, pixels)[0]
         for i in range(group.lead.size):
             value -= math.log(h[group.start[i] + i])
         for s in group.members:
-            value += math.log(fluxes[s] / scale[s] ** 2) - fluxes[s] / scale[s]
-            value += 0.5 * math.log(2.0 * math.pi)
+            value += (shape - 1.0) * math.log(fluxes[s] / scale[s]) - fluxes[s] / scale[s]
+            value += constant - math.log(scale[s])
             if size > 1:
                 square = shifts[s, 0] ** 2 + shifts[s, 1] ** 2
                 value -= 0.5 * square / scatter**2 + 2.0 * math.log(scatter)

@@ -1,22 +1,24 @@
-"""Exact gradient of the log-likelihood, the Laplace term included.
+"""Exact gradient of the log-likelihood, the integral over the fluxes included.
 
 F, K, B and H are those of `fluxes.py`.
 
-Gradient of the Laplace term. Per pixel let r be the score, W = -dr/dmu and C = -1/2 dW/dmu; of
+Gradient of that integral. Per pixel let r be the score, W = -dr/dmu and C = -1/2 dW/dmu; of
 Poisson counts n/mu - 1, n/mu^2 and n/mu^3. For sources s, t let Q = H^-1, q_s = sum_t Q_st K_t, h =
 sum_s K_s q_s. Because dW = -2 C dmu and the maximising F moves by dF = Q d(dL/dF), the chain rule
-gives for any parameter, with z = Q (sum_p C h K + Q_tt / F_t^3) and y = sum_t z_t K_t,
+gives for any parameter, with z = Q (sum_p C h K + a Q_tt/F_t^3 - 1/F_t) and y = sum_t z_t K_t,
 
     d log L = sum_p A dB + sum_s sum_p c_s dK_s,   A = r + C h - W y,   c_s = F_s A + z_s r - W q_s.
 
-The 1/F_t^3 is the prior's share: it adds 1/F_t^2 to H. With fixed fluxes A = r and c_s = F_s r.
+The prior Gamma(a) adds a/F_t^2 to H, and the flux's logarithm -log F_t. The term c of
+`expansion.py` adds dc/dmu to C h, K_t dc/dT_t to the sum in z, and -F_s/W dc/dT_s to q_s. With
+fixed fluxes A = r and c_s = F_s r.
 
 Free positions. With three templates T of every source this holds with q_t = sum_u Q_tu T_u, h =
 sum_t T_t q_t, y = sum_t z_t T_t, and z = G^-1 e, where G is H with the second derivatives and e is
 what moving phi does to -1/2 log det H:
 
-    e_F = sum_p [C h K - W (q_1 X + q_2 Y)] + Q_00/F^3,    e_dx = sum_p [C h F X - W (q_0 X + q_1 F
-    K_xx + q_2 F K_xy)],
+    e_F = sum_p [C h K - W (q_1 X + q_2 Y)] + a Q_00/F^3 - 1/F,
+    e_dx = sum_p [C h F X - W (q_0 X + q_1 F K_xx + q_2 F K_xy)],
 
 e_dy likewise. Every source gives d log L the terms c_0 dK + c_1 dX + c_2 dY,
 
@@ -47,9 +49,8 @@ from bayesfred.model.kernels.clusters import (
     touch,
 )
 from bayesfred.model.kernels.contexts import LIMIT, Touching
+from bayesfred.model.kernels.expansion import Pixels, add_slopes, expand
 from bayesfred.model.kernels.likelihood import (
-    U,
-    background_row,
     log_likelihood,
     next_run,
     unreached_pixels,
@@ -57,7 +58,6 @@ from bayesfred.model.kernels.likelihood import (
 )
 from bayesfred.model.kernels.noise_dispatch import (
     at_level,
-    derivatives,
     level_derivatives,
     unreached,
 )
@@ -84,6 +84,7 @@ class _Adjoint(NamedTuple):
     weight: Floats
     at: Ints  # where the footprints' rows begin in the padded frame
     mixed: Floats  # the templates q = Q T
+    light: Floats  # (samples,) dc/dT over W
     rows: Rows
 
 
@@ -92,22 +93,6 @@ def _constants():
     """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of T."""
     one = np.zeros((1, 2), np.int64)
     return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
-
-
-@inner()
-def _fill_curve(frame, noise, w, background, curve):
-    """C of every marked pixel, zero where masked."""
-    pitch = frame.values.size // frame.ny
-    for j in range(frame.ny):
-        c0, c1, c2 = background_row(background, j, frame.ny)
-        start, stop = next_run(w, j, w.span[j, 0])
-        while start >= 0:
-            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
-                u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                mu = w.image[p] + c0 + u * (c1 + u * c2)
-                n = frame.values[p]
-                curve[p] = derivatives(noise, n, mu, U(p))[2] if n > LIMIT else 0.0
-            start, stop = next_run(w, j, stop)
 
 
 @inner()
@@ -182,48 +167,57 @@ def _second_derivatives(adjoint, group, i, part, g):
 
 
 @inner()
-def _fill_part(adjoint, group, curve, h, part):
-    """Add sum_p T q of a cluster's sources to h, then fill e with sum_p C h T."""
+def _fill_part(adjoint, group, shape, ratio, h, part):
+    """Fill e with a cluster's sums over pixels, h and q including what the term c adds to them."""
     fp, stamps, at = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.at
-    size, mixed, members = stamps.shape[0], adjoint.mixed, group.members
+    size, mixed, members, fluxes = stamps.shape[0], adjoint.mixed, group.members, adjoint.fluxes
     first, starts, sizes = fp.first, fp.start, fp.size
     for s in members:
         for p in range(first[s], first[s + 1]):
             for t in range(size):
                 for k in range(sizes[p]):
                     h[at[p] + k] += stamps[t, starts[p] + k] * mixed[t, starts[p] + k]
+    pixels, light = Pixels(adjoint.weight, ratio, at), adjoint.light
+    _, slopes = expand(adjoint.touching, group, fluxes, shape, pixels)
+    add_slopes(adjoint.touching, group, fluxes, pixels, slopes, (h, light))
     for i in range(part.size):
         s, t = members[i // size], i % size
         part[i] = 0.0
         for p in range(first[s], first[s + 1]):
             for k in range(sizes[p]):
-                part[i] += curve[at[p] + k] * h[at[p] + k] * stamps[t, starts[p] + k]
+                pixel, own = at[p] + k, starts[p] + k
+                change = ratio[pixel] * h[pixel] + (light[own] if t == 0 else 0.0)
+                part[i] += adjoint.weight[pixel] * change * stamps[t, own]
+                if t == 0:
+                    mixed[0, own] -= fluxes[s] * light[own]
 
 
 @inner()
-def _hessian(adjoint, group, scatter, part, lower):
+def _hessian(adjoint, group, prior, part, lower):
     """Cholesky's factor of G; it is positive definite at a maximum, elsewhere H has to do."""
     size, g = adjoint.mixed.shape[0], np.empty(lower.size)
     gram(adjoint.touching, group, adjoint.weight, adjoint.at, g)
-    add_prior(g, group, size, adjoint.fluxes, scatter)
+    add_prior(g, group, size, adjoint.fluxes, prior[0], prior[1])
     for i in range(group.members.size):
         _second_derivatives(adjoint, group, i, part[i * size : (i + 1) * size], g)
     return g if cholesky(g, group) else lower
 
 
 @inner()
-def _laplace_adjoint(w, layout, rendered, profiled, scatter, curve):
+def _laplace_adjoint(w, layout, rendered, profiled, scatter):
     """z, the templates q, the image A and the derivative by tau of the module's derivation."""
     if profiled is None:
         return np.zeros((rendered.fluxes.size, 1)), np.empty((1, 0)), w.score, 0.0
     touching, flux, shift = profiled.touching, rendered.fluxes, profiled.shifts
+    shape = profiled.shape
     fp, clusters, stamps = touching.footprints, touching.clusters, touching.stamps
     size, pitch = stamps.shape[0], w.image.size // w.span.shape[0]
     h, y, z = np.zeros(w.image.size), np.zeros(w.image.size), np.empty((flux.size, size))
     at, mixed = row_starts(fp, pitch), np.zeros(stamps.shape)
     rows = new_rows(layout, _constants(), pitch)
+    grid, light = pixel_grid(layout), np.zeros(stamps.shape[1])
     adjoint = _Adjoint(
-        layout.geometry, pixel_grid(layout), touching, flux, w.score, w.weight, at, mixed, rows
+        layout.geometry, grid, touching, flux, w.score, w.weight, at, mixed, light, rows
     )
     slope = 0.0
     for c in range(clusters.first.size - 1):
@@ -231,11 +225,12 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, curve):
         lower = profiled.factors[clusters.begin[c] : clusters.begin[c + 1]]
         diagonal = _mix(adjoint, group, lower)
         part = np.empty(diagonal.size)
-        _fill_part(adjoint, group, curve, h, part)
+        _fill_part(adjoint, group, shape, w.ratio, h, part)
         for i in range(0, part.size, size):
-            part[i] += diagonal[i] / flux[group.members[i // size]] ** 3
+            own = flux[group.members[i // size]]
+            part[i] += shape * diagonal[i] / own**3 - 1.0 / own
         if size > 1:
-            lower = _hessian(adjoint, group, scatter, part, lower)
+            lower = _hessian(adjoint, group, (shape, scatter), part, lower)
         solve(lower, group, part)
         for i in range(part.size):
             s, t = group.members[i // size], i % size
@@ -247,7 +242,7 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, curve):
     for k in range(w.flags.size):
         if w.flags[k] != 0:
             for p in range(k * SEGMENT, (k + 1) * SEGMENT):
-                h[p] = w.score[p] + curve[p] * h[p] - w.weight[p] * y[p]
+                h[p] = w.score[p] + w.weight[p] * (w.ratio[p] * h[p] - y[p])
     return z, mixed, h, slope
 
 
@@ -302,14 +297,9 @@ def gradient(problem, w, rendered, parameters, basis, out):
         return math.nan, np.empty((0, 0))
     fp, pitch = rendered.footprints, w.image.size // o.ny
     layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
-    curve = np.empty(w.image.size if rendered.profiled is not None else 0)
-    weigh_rows(frame, noise, w, background, 0, o.ny)
-    if curve.size > 0:
-        _fill_curve(frame, noise, w, background, curve)
+    weigh_rows(frame, noise, w, background, (0, o.ny), rendered.profiled is not None)
     scatter = parameters.nuisances.position_scatter
-    z, mixed, image, slope = _laplace_adjoint(
-        w, layout, rendered, rendered.profiled, scatter, curve
-    )
+    z, mixed, image, slope = _laplace_adjoint(w, layout, rendered, rendered.profiled, scatter)
     _add_background(frame, w, image, out[1])
     out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]
     out[1][0] += level_derivatives(frame.noise, frame.pixels, level, value)[0]

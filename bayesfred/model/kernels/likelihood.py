@@ -18,6 +18,7 @@ from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geom
 from bayesfred.model.kernels.contexts import LIMIT, Unreached, Workspace
 from bayesfred.model.kernels.noise_dispatch import at_level, derivatives, log_density, unreached
 
+LEAST = 1e-200  # weight of a pixel that tells anything
 U = np.uint64  # an index that has no sign need not be compared with zero
 
 
@@ -52,7 +53,8 @@ def new_workspace(o, nuisances, free):
         samples = find_footprints(o, geometry).start[-1]
         more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
     flags = np.zeros(size // SEGMENT, np.uint8)
-    return Workspace(np.zeros(size), flags, span, np.empty(size), np.empty(size), np.empty(more))
+    score, weight, ratio = np.empty(size), np.empty(size), np.empty(size)
+    return Workspace(np.zeros(size), flags, span, score, weight, ratio, np.empty(more))
 
 
 @inner()
@@ -152,29 +154,46 @@ def stretch(frame, background, j, first, image):
 
 
 @inner(fastmath=FAST, error_model="numpy")
-def weigh_run(noise, part, score, weight):
-    """Score d log L/d mu and weight -d^2 log L/d mu^2 of a stretch, zero where masked."""
+def weigh_run(noise, part, score, weight, ratio):
+    """Score d log L/d mu and weight -d^2 log L/d mu^2 of a stretch, zero where masked.
+
+    And, unless `ratio` is None, the ratio of d^3 log L/d mu^3 to twice the weight.
+    """
     values, image, first = part.values, part.image, part.first
     c0, c1, c2, u, step = part.c0, part.c1, part.c2, part.u, part.step
     for i in range(values.size):
         x = u + step * i
         mu = image[i] + (c0 + x * (c1 + x * c2))
         counted = values[i] > LIMIT
-        s, w, _ = derivatives(noise, values[i] if counted else mu, mu, U(first + i))
+        s, w, c = derivatives(noise, values[i] if counted else mu, mu, U(first + i))
         score[i], weight[i] = s if counted else 0.0, w if counted else 0.0
+        if ratio is not None:
+            ratio[i] = c / w if counted and w > LEAST else 0.0
 
 
 @inner()
-def weigh_rows(frame, noise, w, background, top, last):
-    """Score and weight of the marked pixels in rows top..last-1."""
+def _weigh_rows(frame, noise, w, background, rows, ratios):
     pitch = frame.values.size // frame.ny
-    for j in range(top, last):
+    for j in range(rows[0], rows[1]):
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             a, b = j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT
             part = stretch(frame, background, j, a, w.image[a:b])
-            weigh_run(noise, part, w.score[a:b], w.weight[a:b])
+            ratio = None if ratios is None else ratios[a:b]
+            weigh_run(noise, part, w.score[a:b], w.weight[a:b], ratio)
             start, stop = next_run(w, j, stop)
+
+
+@inner()
+def weigh_rows(frame, noise, w, background, rows, ratios):
+    """Score and weight of the marked pixels of rows (first, last + 1), and their ratios if wanted.
+
+    Where they are not, the ratios are left as they are.
+    """
+    if ratios:
+        _weigh_rows(frame, noise, w, background, rows, w.ratio)
+    else:
+        _weigh_rows(frame, noise, w, background, rows, None)
 
 
 @inner(fastmath=FAST)

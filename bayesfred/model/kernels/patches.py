@@ -20,6 +20,7 @@ class Patch(NamedTuple):
     image: Floats
     score: Floats
     weight: Floats
+    ratio: Floats
 
 
 @inner()
@@ -49,16 +50,17 @@ def new_patch(w, touching, group, at):
     size = start[rows]
     image = room(w, 0, size)
     image[:] = 0.0
-    return Patch(top, low, start, image, w.score[:size], w.weight[:size])
+    return Patch(top, low, start, image, w.score[:size], w.weight[:size], w.ratio[:size])
 
 
 @inner()
-def weigh_patch(frame, noise, background, patch):
-    """Score and weight of a patch's pixels."""
+def weigh_patch(frame, noise, background, patch, ratios):
+    """Score and weight of a patch's pixels; their ratios into `ratios` unless it is None."""
     for j in range(patch.first.size):
         a, b = patch.start[j], patch.start[j + 1]
         part = stretch(frame, background, patch.top + j, patch.first[j], patch.image[a:b])
-        weigh_run(noise, part, patch.score[a:b], patch.weight[a:b])
+        ratio = None if ratios is None else ratios[a:b]
+        weigh_run(noise, part, patch.score[a:b], patch.weight[a:b], ratio)
 
 
 @inner(fastmath=FAST)
