@@ -2,6 +2,7 @@
 refits of simulated data."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -254,3 +255,26 @@ def test_errors_hold_where_positions_scatter() -> None:
     )  # its maximum is biased by some 1 / 50
     # negative control: photon noise alone does not explain the errors
     assert np.mean(squares[False]) > 1 + 10 * LIMIT * error
+
+
+@pytest.mark.parametrize("radius", [8.0, 11.0, 14.0, 17.0])
+def test_a_source_without_pixels_changes_nothing(radius: float) -> None:
+    """Masked with its wings, or with all but pixels that hold next to nothing of it.
+
+    Its flux has the prior Gamma(2), of which the Laplace approximation takes 0.92 for 1.
+    """
+    catalogue = SourceCatalog([-12.0, 12.0, 0.0], [-8.0, -10.0, 12.0], [400.0] * 3)
+    d = PolynomialDistortion([(1, 0, 0, 0)], [])
+    model = ForwardModel(Detector((43, 43)), catalogue, GaussianPSF(1.5), d)
+    counts = simulate(model, [0.02], 1.0, seed=3)
+    u, v = model.detector.pixel_centres()
+    mask = u**2 + (v[:, None] - 12.0) ** 2 > radius**2
+    nuisances = Nuisances("free", position_scatter=True)
+    whole = Posterior(model, counts, mask=mask, nuisances=nuisances)
+    rest = Posterior(
+        replace(model, sources=SourceCatalog([-12.0, 12.0], [-8.0, -10.0], [400.0] * 2)),
+        counts, mask=mask, prior=whole.prior, nuisances=nuisances,
+    )  # fmt: skip
+    params = np.array([0.02, 1.0, 0.2])
+    assert whole.log_prob(params) == pytest.approx(rest.log_prob(params), abs=0.1)
+    assert whole.fluxes(params)[2] == pytest.approx(200.0, rel=1e-3)

@@ -23,6 +23,7 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.laplace import importance_efficiency, laplace
 from bayesfred.sampling.sampler import sample
@@ -87,6 +88,13 @@ def test_moments_are_those_of_the_information() -> None:
     # nothing but a normal distribution: the sampler's proposal has heavy tails besides
     assert np.all(np.abs(z) < 5.5)
     np.testing.assert_allclose(chain.log_prob.ravel(), density.log_prob(chain.draws()), rtol=1e-12)
+
+
+@pytest.mark.parametrize("at", [-1e-4, 1e-4, 3.0])
+def test_a_bound_close_to_the_maximum_leaves_its_covariance(at: float) -> None:
+    """Whichever sign the small gradient has where the search ends."""
+    found = maximize(Normal(np.array([[1.0]]), least=-0.3), np.array([at]))
+    assert found.covariance == pytest.approx(np.ones((1, 1)))
 
 
 @pytest.mark.parametrize("at", [0.0, 0.7])

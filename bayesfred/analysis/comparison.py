@@ -86,7 +86,8 @@ class Score:
     log_evidence, evidence_error : float
         Logarithm of the evidence, with the standard deviation of its Monte Carlo error.
     pareto_k : float
-        Largest shape of the weights of a fold's evidence; -inf where none has a tail.
+        Largest shape of the weights of a fold's evidence; -inf where none has a tail, inf where
+        a few draws have all the weight of one.
     n_unreliable : int
         Folds whose shape exceeds 1 - 1 / log10(200): their part of elpd is not to be trusted.
     by_fold : ndarray, shape (K,)

@@ -49,6 +49,7 @@ from bayesfred.sampling.moves import LaplaceMove
 __all__ = ["Evidence", "importance_evidence", "log_evidence", "random_numbers"]
 
 PROPOSALS = 1000
+COARSE = 0.3  # error above which a few draws decide
 EVEN = 5.0  # largest weight over their mean: the shape of such a tail is noise, and no matter
 STREAM = 20  # apart from the random numbers that made the chain
 OUTSIDE = "the proposal of the maximum finds no posterior, expected the posterior's maximum"
@@ -139,7 +140,8 @@ def importance_evidence(
     -------
     evidence : Evidence
     pareto_k : float
-        Shape of the tail of the weights; -inf where none is 5 times their mean. Above
+        Shape of the tail of the weights; -inf where none is 5 times their mean, inf where the
+        error exceeds 0.3, as a few draws then have all the weight. Above
         min(1 - 1 / log10(number), 0.7) neither the evidence nor its error is to be trusted.
 
     Raises
@@ -154,8 +156,13 @@ def importance_evidence(
     ratios = _proposed(density, LaplaceMove.of(density, top), top, number, random)
     weights = np.exp(ratios - ratios.max())
     error = float(np.std(weights, ddof=1) / np.mean(weights) / math.sqrt(number))
-    even = weights.max() <= EVEN * weights.mean()
-    shape = -np.inf if even else float(array_stats.psislw(-ratios)[1])
+    if error > COARSE:
+        shape = np.inf
+    elif weights.max() <= EVEN * weights.mean():
+        shape = -np.inf
+    else:
+        with np.errstate(all="ignore"):  # of weights that are zero
+            shape = float(array_stats.psislw(-ratios)[1])
     return Evidence(float(logsumexp(ratios) - math.log(number)), error), shape
 
 

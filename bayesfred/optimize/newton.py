@@ -155,11 +155,13 @@ def _at_edges(
 
     Where the background has no counts, the log-posterior falls linearly from its edge, while the
     information about it has no bound. A fall by exp(-g x) has the standard deviation 1/g; it stands
-    for information that predicts less.
+    for information that predicts less. A maximum inside is no such fall, however close the edge:
+    there a Newton step does not go there.
     """
     information, known = information.copy(), np.diag(information).copy()
     room = np.where(gradient < 0.0, params - support[0], support[1] - params)
-    for k in np.flatnonzero((room * np.sqrt(known) <= 1.0) | (room <= 0.0)):
+    falls = (room * np.sqrt(known) <= 1.0) & (np.abs(gradient) >= 0.5 * known * room)
+    for k in np.flatnonzero(falls | (room <= 0.0)):
         if known[k] > gradient[k] ** 2 > 0.0:
             information[k], information[:, k] = 0.0, 0.0
             information[k, k] = gradient[k] ** 2

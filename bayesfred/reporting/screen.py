@@ -187,7 +187,7 @@ def comparison_table(compared: Comparison, width: int) -> Table:
             ),
             _Column(
                 "Pareto k",
-                [f"{s.pareto_k:.2f}" if np.isfinite(s.pareto_k) else "" for s in scores],
+                [f"{s.pareto_k:.2f}" if s.pareto_k > -np.inf else "" for s in scores],
                 3,
             ),
         ],
