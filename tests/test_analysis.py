@@ -233,7 +233,7 @@ def most_likely(counts: Floats, start: tuple[float, float], read_noise: float = 
 def chain_at(params: Floats, posterior: Any, **changes: Any) -> Any:
     """Stand-in for a chain of independent draws around `params`."""
     draws = np.random.default_rng(11).normal(size=(4, 15, 32, 2)) * 0.1 + params
-    estimate = MapEstimate(np.asarray(params), np.eye(2), 0.0, 1, "done")
+    estimate = MapEstimate(params, np.eye(2), 0.0, 1, "done")
     fields = {
         "parameter_names": posterior.parameter_names,
         "chain": draws,
@@ -466,14 +466,7 @@ def shifted() -> Floats:
         ({"accepted": np.full((4, 32), 1)}, "acceptance"),
         ({"burn_in": 9}, "effective sample size"),
         ({"burn_in": 15}, "R-hat"),
-        (
-            {
-                "estimate": MapEstimate(
-                    np.array([1.0, 5.0]), np.eye(2), 0.0, 1, "lost", at_maximum=False
-                )
-            },
-            "lost",
-        ),
+        ({"estimate": MapEstimate(np.array([1.0, 5.0]), np.eye(2), 0.0, 1, "lost", False)}, "lost"),
     ],
     ids=["ensembles disagree", "hardly accepts", "too short", "no draws", "no MAP"],
 )

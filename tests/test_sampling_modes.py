@@ -74,7 +74,7 @@ def test_quantiles_in_one_dimension(first: int) -> None:
 @pytest.mark.parametrize("first", range(0, 50, 10))
 def test_quantiles_in_two_dimensions(first: int) -> None:
     """Four stars of 8 photons in 50 frames."""
-    grid = np.linspace(-4.5, 4.5, 181) * SPREAD
+    grid = np.linspace(-4.5, 4.5, 121) * SPREAD
     errors = []
     for seed in range(first, first + 10):
         posterior = multimodal.faint(seed)

@@ -196,10 +196,11 @@ def judge_approximation(chain: Chain, efficiency: float) -> str:
 def mode_shares(chain: Chain) -> tuple[float, ...]:
     """The shares of the draws that lie in the posterior's modes, largest first.
 
-    Modes with less than a hundredth of the draws are left out; so are draws between modes.
+    Modes with less than a hundredth of the draws are left out; so are draws between modes. Of a
+    single mode the share is 1.
     """
-    modes = chain.estimate.modes
-    if modes is None:
+    modes = chain.estimate.mixture
+    if modes.count == 1:
         return (1.0,)
     draws = chain.draws()
     shares = np.bincount(modes.assign(draws), minlength=modes.count)[: modes.count] / len(draws)
