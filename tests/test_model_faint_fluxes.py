@@ -130,6 +130,8 @@ class Field:
             step = np.linalg.solve(h, slope[..., None])[..., 0]
             largest = np.abs(step / fluxes).max(axis=1, keepdims=True)
             fluxes = fluxes + step / np.where(largest < 0.5, 1.0, 1.0 + largest)
+            if largest.max() < 1e-7:
+                break
         value = self.noise.log_likelihood(cells, mean, level).sum(axis=1)
         value += (self.prior(fluxes) - np.log(fluxes)).sum(axis=1)
         return np.asarray(value - 0.5 * np.linalg.slogdet(h / (2 * math.pi))[1])
@@ -199,7 +201,8 @@ def test_no_parameter_of_a_thousand_faint_sources_is_biased(case: str) -> None:
     control = control and field.background == 1.0
     ours, plain, error = biases(field, 6, 801, control)
     print(case, "ours", ours.round(3), "plain", plain.round(3), "errors", error.round(3))
-    assert np.all(np.abs(ours) < BOUND + LIMIT * error) and error.max() < 0.05
+    bound = BOUND if field.shape >= 2.0 else 2 * BOUND  # the expansion is in 1 / shape, too
+    assert np.all(np.abs(ours) < bound + LIMIT * error) and error.max() < 0.05
     assert not control or np.abs(plain).max() > 3 * BOUND  # the plain Laplace marginal is
 
 
@@ -213,8 +216,8 @@ def moments(axis: Floats, values: Floats) -> tuple[float, float]:
 @pytest.mark.parametrize("group", [1, 2], ids=["single", "pairs"])
 @pytest.mark.statistics
 def test_the_posterior_of_the_width_is_that_of_exact_integrals(group: int) -> None:
-    # 225 single sources of 5 photons on a background of 1, and 450 in pairs one sigma apart
-    field, rng = Field(15, group, 5.0, 1.0), np.random.default_rng(802)
+    # 225 single sources of 3 photons on a background of 1, and 450 in pairs one sigma apart
+    field, rng = Field(15, group, 3.0, 1.0), np.random.default_rng(802)
     frame = field.draw(rng)
     cells, posterior = field.cells(frame), field.posterior(frame)
     axis = np.linspace(1.05, 2.2, 24)
@@ -234,7 +237,7 @@ def test_the_posterior_of_the_width_is_that_of_exact_integrals(group: int) -> No
     assert abs(shift["plain"]) > 3 * BOUND
 
 
-FAINT = Field(20, 1, 5.0, 1.0)  # 400 sources
+FAINT = Field(20, 1, 3.0, 1.0)  # 400 sources
 PRIOR = {
     "f_x": stats.norm(0.0, 2e-3),
     "g_y": stats.norm(0.0, 2e-3),
@@ -247,10 +250,10 @@ PRIOR = {
 
 @pytest.mark.long
 def test_posteriors_of_400_faint_sources_are_calibrated(tmp_path: Path) -> None:
-    # rejects exact posteriors in 1 of 100 cases, and 100 frames notice a mean pull of 0.4
+    # rejects exact posteriors in 1 of 100 cases; 60 frames notice a mean pull of 0.5
     posterior = replace(FAINT.posterior(np.ones((20 * CELL,) * 2)), prior=PRIOR)
     result = bf.calibrate_posterior(
-        posterior, replicates=100, path=tmp_path / "sbc.ecsv", seed=803, workers=1, progress=False
+        posterior, replicates=60, path=tmp_path / "sbc.ecsv", seed=803, workers=1, progress=False
     )
     print(result.message, result.quantities["quantity"], result.quantities["pull"].round(2))
     assert result.calibrated, result.message
@@ -260,7 +263,7 @@ def test_posteriors_of_400_faint_sources_are_calibrated(tmp_path: Path) -> None:
 def test_the_plain_laplace_marginal_of_400_faint_sources_is_not_calibrated() -> None:
     # pulls of psf_sigma, everything else known, on a grid; their mean has the error 1/sqrt(frames)
     rng, axis, pulls = np.random.default_rng(804), np.linspace(1.1, 2.0, 31), []
-    for _ in range(40):
+    for _ in range(24):
         truth = rng.uniform(1.1, 2.0)
         frame = FAINT.draw(rng, truth)
         posterior, cells = FAINT.posterior(frame), FAINT.cells(frame)
@@ -294,9 +297,9 @@ def test_frames_are_drawn_with_the_fluxes_that_the_prior_allows() -> None:
     assert abs(ratio - 4) > LIMIT * error  # negative control: shape 2
 
 
-@pytest.mark.parametrize("shape", [0.0, 0.4, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("shape", [0.0, 0.9, -1.0, math.nan, math.inf])
 def test_shapes_without_an_expansion_are_refused(shape: float) -> None:
-    with pytest.raises(InputError, match=r"flux_shape: got .* expected a number >= 0\.5"):
+    with pytest.raises(InputError, match=r"flux_shape: got .* expected a number >= 1"):
         Nuisances("free", flux_shape=shape)
 
 

@@ -357,7 +357,8 @@ class FrameLikelihood:
     def _faint(self) -> Flags:
         """Sources of fewer than `BRIGHT` standard deviations, by the catalogue and the frame."""
         counts = np.maximum(self.counts, 0.0)
-        variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
+        with np.errstate(all="ignore"):  # at a mean of zero
+            variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
         area = 4.0 * np.pi * (self.model.psf.sigma / self.model.detector.binning) ** 2
         return self._flux**2 < BRIGHT**2 * (self._flux + area * variance)
 

@@ -19,7 +19,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.io.serialize import serializable
 
 FluxMode = Literal["fixed", "scale", "free"]
-LEAST_SHAPE = 0.5  # of a Gamma prior; the integral over fluxes is expanded in its inverse
+LEAST_SHAPE = 1.0  # of a Gamma prior; the integral over fluxes is expanded in its inverse
 
 
 @serializable("nuisances")
@@ -51,9 +51,10 @@ class Nuisances:
         deviation along each axis: parameter `position_scatter`, pixel, as imaged. Needs free
         fluxes. Like these, the shifts are not sampled.
     flux_shape : float
-        Shape of the free fluxes' Gamma prior, which has the relative standard deviation
+        Shape of the free fluxes' Gamma prior, at least 1, which has the relative standard deviation
         1/sqrt(flux_shape): 2, the default, says little, 25 that the catalogue's fluxes are right to
-        20 %.
+        20 %. With 1 a PSF's width from 1,000 sources of 5 photons is biased by 0.2 standard
+        deviations, from 2 on by less than 0.1.
 
     Raises
     ------
