@@ -32,7 +32,7 @@ class MapEstimate:
         of parameters at a bound of their prior it may point out of the support.
     fits_data : bool
         Whether deviance and Pearson's statistic there are what the noise makes them, within 5
-        standard deviations, and enough sources are matched.
+        standard deviations, and enough sources are matched. `diagnose` tests more.
     """
 
     params: Floats
