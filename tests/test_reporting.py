@@ -217,7 +217,7 @@ def test_alternative_texts_say_what_is_seen(tmp_path: Path) -> None:
     residual = frame.residual()[frame.mask]
     field, seen, stars, residuals, pairs, others, trace = page.alternatives
     assert field.startswith("Displacement: rms ")
-    assert "Of 9 sources 0 have a chi-square more than 5" in residuals
+    assert "Of 9 sources 0 do not fit." in residuals
     assert f"{frame.counts[frame.mask].max():.0f} counts" in seen
     assert f"{residual.max():.1f} standard deviations" in seen
     assert f"{100 * np.mean(np.abs(residual) > 3):.2f} % of {residual.size} pixels" in seen

@@ -56,7 +56,7 @@ from bayesfred.model.posterior import Posterior
 
 __all__ = ["FALSE_ALARM", "Lead", "ScoreTests", "score_tests"]
 
-FALSE_ALARM = 0.004  # chance that any of these tests fails if the model is true
+FALSE_ALARM = 0.003  # chance that any of these tests fails if the model is true
 LEAST = 0.01  # share of a number's information that the fitted parameters must leave
 MEANING = "what a fit would add to it, by its score"
 

@@ -67,7 +67,7 @@ CERTAIN = 40.0  # standard deviations that nothing makes probable
 ITERATIONS = 30
 STEP = 1e-3  # share of the variance by which the mean is changed to find the variance's slope
 DETERMINED = 1e-4  # share of a template that earlier ones leave, or it is not told from them
-FALSE_ALARM = 0.004  # chance that any source fails if the model is true
+FALSE_ALARM = 0.003  # chance that any source fails if the model is true
 FALSE_ALARM_OF_SPREADS = 0.001
 
 

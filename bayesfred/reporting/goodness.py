@@ -93,7 +93,7 @@ def _draw_phase(ax: Axes, phases: tuple[PixelPhase, PixelPhase]) -> None:
 
 
 def _draw_sources(fig: Figure, ax: Axes, residuals: Residuals, shape: tuple[int, int]) -> None:
-    """Every source's chi-square, in standard deviations, where its image is."""
+    """Every source's chi-square, in standard deviations; rings around those that do not fit."""
     ny, nx = shape
     table = residuals.sources
     z = np.asarray(table["chi2_z"])
@@ -104,10 +104,15 @@ def _draw_sources(fig: Figure, ax: Axes, residuals: Residuals, shape: tuple[int,
         table["u"][order], table["v"][order], c=z[order], s=size, cmap="RdBu_r",
         norm=Normalize(-LIMIT, LIMIT), edgecolors="0.25", linewidths=0.5,
     )  # fmt: skip
+    failed = np.flatnonzero(table["failed"])
+    ax.scatter(
+        table["u"][failed], table["v"][failed], s=260, facecolors="none", edgecolors="black",
+        linewidths=1.3,
+    )  # fmt: skip
     fig.colorbar(points, ax=ax, label="chi-square: excess / sd", extend="both", shrink=0.9)
     ax.set(
         xlim=(-nx / 2, nx / 2), ylim=(-ny / 2, ny / 2), aspect="equal", xlabel="u / pixel",
-        ylabel="v / pixel", title="Sources",
+        ylabel="v / pixel", title="Sources (ringed: do not fit)" if failed.size else "Sources",
     )  # fmt: skip
 
 
@@ -142,11 +147,8 @@ def described_residuals(residuals: Residuals) -> str:
                 f"Along {axis} displacements vary with the position within the pixel by "
                 f"{phase.value:.2g} pixel ({_signed(phase.z)} standard deviations)."
             )
-    beyond = int(np.sum(np.abs(z) > LIMIT))
-    parts.append(
-        f"Of {z.size} sources {beyond} have a chi-square more than {LIMIT:.0f} standard deviations "
-        "off."
-    )
+    failed = int(np.sum(residuals.sources["failed"]))
+    parts.append(f"Of {z.size} sources {failed} do not fit.")
     return " ".join(parts)
 
 

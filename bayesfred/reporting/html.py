@@ -119,6 +119,7 @@ def write_report(
             html_symbol(parameters[name]) for name in diagnostics.prior_dominated
         ),
         has_truth="truth" in summary.colnames,
+        has_robust="robust_sd" in summary.colnames,
         statistics=_statistics(diagnostics),
         figures=embedded_figures(figures),
         provenance=_provenance(chain, diagnostics),

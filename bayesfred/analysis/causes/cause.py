@@ -12,7 +12,7 @@ class Cause:
     name : str
         One of "saturation", "gain", "read noise", "pedestal", "over-dispersion", "background",
         "unmatched", "origin", "parity", "shift", "rotation or scale", "missing terms",
-        "wrong sources", "uncatalogued sources", "fluxes" and "PSF".
+        "wrong sources", "positions", "uncatalogued sources", "fluxes" and "PSF".
     share : float
         Part of the misfit that it explains, from 0 to 1; 1 also where nothing can be judged.
     sentence : str

@@ -15,6 +15,7 @@ from bayesfred.analysis.score_tests import Lead, ScoreTests
 from bayesfred.analysis.source_tests import KINDS, SourceTests
 from bayesfred.model.posterior import Posterior
 
+NOISE = 2.0  # standard deviations by which a spread has to explain more than chance
 MORE_TERMS = (
     "missing terms",
     "add terms to the distortion, such as a polynomial of a higher degree",
@@ -77,7 +78,8 @@ def hidden_causes(
         kind, text, remedy = SPREADS[spread.name]
         pixel = posterior.model.detector.binning if spread.name == "positions" else 1.0
         cause = Cause(spread.name, 0.0, text.format(spread.estimate / pixel), remedy)
-        explained = float(others[:, KINDS[kind]].sum())
+        some = others[:, KINDS[kind]]
+        explained = float(some.sum()) - NOISE * (2.0 * some.size) ** 0.5
         findings.append(Finding(cause, explained, spread.name, RICHER))
     total = max([float(own.sum()), *(finding.explained for finding in findings)], default=0.0)
     return ranked(findings, total)
@@ -115,4 +117,4 @@ def _few_sources(posterior: Posterior, failed: Ints, explained: float) -> Findin
         f"{names}{more}",
         "correct their positions and fluxes, or leave them out",
     )  # fmt: skip
-    return Finding(cause, explained, "wrong sources")
+    return Finding(cause, explained, "wrong sources", RICHER)
