@@ -144,7 +144,9 @@ def test_free_fluxes_are_predicted_as_exact_refits_do() -> None:
     found = predicted(posterior, laplace(posterior))
     assert found == pytest.approx(direct + 0.04, abs=0.1)
     fixed = replace(posterior, nuisances=bf.Nuisances())
-    assert predicted(fixed, laplace(fixed)).sum() > found.sum() + 3.0
+    compared = compare({"free": laplace(posterior), "fixed": laplace(fixed)})
+    assert compared.chosen == "fixed" and compared.scores[1].difference > 3.0
+    assert [score.n_parameters for score in compared.scores] == [2, 5]
 
 
 def test_scattered_positions_are_predicted_as_exact_refits_do() -> None:
