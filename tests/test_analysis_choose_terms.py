@@ -152,7 +152,7 @@ def test_terms_of_other_degrees_are_judged_by_their_size() -> None:
     assert leaner < 1e-6 and np.isnan(chosen) and min(larger) > 0.01
     table = choice.tried.copy()
     table["p"][-1] = 0.002
-    said = f"though terms of degree {table['degree'][-1]} are real (p = 0.002)"
+    said = f"though terms of degree {table['degree'][-1]} (p = 0.002) are real"
     assert said in module._message(table, 1) and said not in choice.message
     assert choice.lines()[0].endswith(f"other terms are chance with p = {leaner:.2g}")
 

@@ -144,7 +144,9 @@ def test_free_fluxes_are_predicted_as_exact_refits_do() -> None:
     found = predicted(posterior, laplace(posterior))
     assert found == pytest.approx(direct + 0.04, abs=0.1)
     fixed = replace(posterior, nuisances=bf.Nuisances())
-    assert predicted(fixed, laplace(fixed)).sum() > found.sum() + 3.0
+    compared = compare({"free": laplace(posterior), "fixed": laplace(fixed)})
+    assert compared.chosen == "fixed" and compared.scores[1].difference > 3.0
+    assert [score.n_parameters for score in compared.scores] == [2, 5]
 
 
 def test_scattered_positions_are_predicted_as_exact_refits_do() -> None:
@@ -254,7 +256,10 @@ def test_useless_terms_fit_the_scatter_of_the_catalogue_and_are_not_chosen() -> 
 @pytest.mark.statistics
 @pytest.mark.parametrize("scatter", [0.0, 0.15])
 def test_useless_terms_are_hardly_ever_chosen(scatter: float) -> None:
-    """In 50 frames, of which 2.5 are 5 %: up to 6 have a probability of 0.99."""
+    """In 50 frames, of which 2.5 are 5 %: up to 6 have a probability of 0.99.
+
+    Measured were 0 with a scatter of 0.15 pixels, and 0 chosen.
+    """
     compared = [compare(both(scattered(seed, scatter), USELESS)) for seed in range(50)]
     gains = np.array([gain(each) for each in compared])
     assert np.sum(gains[:, 0] > 2.0 * gains[:, 1]) <= 6
@@ -271,8 +276,11 @@ def test_leaving_out_pixels_prefers_useless_terms() -> None:
 
 @pytest.mark.statistics
 def test_a_small_term_is_called_real_though_it_hardly_predicts() -> None:
-    """Of 3.5 sd, in 50 frames: it is chosen in a few, and real in 70 % (error 6 %), with a
-    probability of 0.01 without it (and then at most 3 of 50, with a probability of 0.998)."""
+    """Of 3.5 sd, in 50 frames: measured are 8 in which it is chosen and 39 in which it is real.
+
+    The shares have errors of 0.06. Without it the probability is 0.01, and that of more than 3
+    frames in 50 is 0.002.
+    """
     estimate = bf.find_map(bf.Posterior(field(QUADRATIC), scattered(0, 0.0)))
     small = 3.5 * float(np.sqrt(estimate.covariance[1, 1]))
     for size, fewest, most in ((small, 26, 50), (0.0, 0, 3)):

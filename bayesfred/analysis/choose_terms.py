@@ -292,9 +292,9 @@ def _message(tried: Table, best: int) -> str:
     if larger := [str(degree) for degree in degrees[best + 1 :]]:
         plural = "s" if len(larger) > 1 else ""
         message += f"; degree{plural} {' and '.join(larger)} would not predict better"
-    for row in tried[best + 1 :]:
-        if row["p"] < REAL:
-            message += f", though terms of degree {row['degree']} are real (p = {row['p']:.2g})"
+    real = [f"{row['degree']} (p = {row['p']:.2g})" for row in tried[best + 1 :] if row["p"] < REAL]
+    if real:
+        message += f", though terms of degree {' and '.join(real)} are real"
     if len(larger) < FAILURES:
         last = int(degrees[-1])
         message += (

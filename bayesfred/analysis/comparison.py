@@ -2,9 +2,9 @@
 
 Pixels of one star share its errors: its position, its flux, the PSF there. A model that fits these
 with needless terms predicts every single pixel better from the others of the same star, and the
-next star worse. So whole sources are left out. They are dealt to folds that each cover the field
-(`folds`); of up to 20 sources each is a fold of its own. The pixels F of a fold are predicted from
-the others, R:
+next star no better. So whole sources are left out. They are dealt to folds that each cover the
+field (`folds`); of up to 20 sources each is a fold of its own. The pixels F of a fold are predicted
+from the others, R:
 
     log p(F | R) = log Z(F, R) - log Z(R),
 
@@ -75,6 +75,7 @@ class Score:
     ----------
     name : str
     n_parameters : int
+        Free numbers: parameters, and every source's flux and shifts where these are free.
     elpd, elpd_se : float
         Expected log predictive density of the frame, leaving out one fold of the sources at a
         time, and its standard error.
@@ -331,7 +332,8 @@ def _scores(fitted: Mapping[str, _Fitted], weights: Mapping[str, float]) -> tupl
         scores.append(
             Score(
                 name,
-                fit.posterior.n_parameters,
+                fit.posterior.n_parameters
+                + fit.posterior.nuisances.profiled * len(fit.posterior.model.sources),
                 float(fit.by_fold.sum()),
                 math.hypot(_error_of_sum(fit.by_fold), fit.error),
                 float(behind.sum()),
