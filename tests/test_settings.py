@@ -67,6 +67,7 @@ def test_defaults(tmp_path: Path) -> None:
             "psf_sigma": False,
             "background_order": 0,
             "position_scatter": False,
+            "flux_shape": 2.0,
         },
         "prior": {},
         "sampling": {"seed": 1, "ensembles": 4, "walkers": 32, "target_ess": 1000},
