@@ -197,15 +197,13 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
     Raises
     ------
     InputError
-        If there are fewer than two chains, one is not of a frame or not sampled well, their counts
-        or masks differ, or some give probabilities of integer counts and others densities; if
-        fewer than three sources have their image in the frame.
+        If there are fewer than two chains, one is not of a frame, not sampled well or has several
+        modes, their counts or masks differ, or some give probabilities of integer counts and others
+        densities; if fewer than three sources have their image in the frame.
 
     Notes
     -----
-    It takes some 20 fits and 4,000 log-posteriors of each model. The Laplace approximation makes
-    the predicted density of a source whose flux is free too large by 0.08 in its logarithm, in
-    every such model.
+    It takes some 20 fits and 4,000 log-posteriors of each model.
 
     References
     ----------
@@ -283,6 +281,10 @@ def _require_comparable(posteriors: Mapping[str, Posterior]) -> None:
 
 
 def _require_sampled(name: str, chain: Chain) -> None:
+    if chain.estimate.modes is not None:  # each would need a refit without every fold
+        raise InputError(
+            f"{name}: got a posterior of several modes, expected one: narrow the priors"
+        )
     if chain.method == "mcmc":
         rhat, *ess = convergence(chain.chain[:, chain.burn_in :])
         acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
