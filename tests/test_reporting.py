@@ -32,6 +32,7 @@ from bayesfred.io.summary_table import make_table
 from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.reporting.field import field_plot
 from bayesfred.reporting.figures import PageFigure, described_residual, page_figures
 from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
@@ -84,9 +85,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
     )
     posterior.parameters = described(*names)
     posterior.likelihood = Posterior(model, counts).likelihood
-    estimate = SimpleNamespace(
-        params=centre, at_maximum=True, message="gradient <small>", n_evaluations=9
-    )
+    estimate = MapEstimate(centre, np.eye(len(centre)), 0.0, 9, "gradient <small>")
     fields = {
         "path": Path("chains/a & b.h5"),
         "parameter_names": names,
