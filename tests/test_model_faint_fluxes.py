@@ -67,6 +67,7 @@ class Field:
             SourceCatalog(x, y, np.full(x.size, self.flux)),
             GaussianPSF(SIGMA),
             PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]),
+            tolerance=1e-8,
         )
         nuisances = Nuisances("free", offset=True, psf_sigma=True, flux_shape=self.shape)
         return Posterior(model, counts, noise=self.noise, nuisances=nuisances)
