@@ -394,7 +394,7 @@ def test_integral_over_an_isolated_flux(background: float) -> None:
         posterior, params = make_posterior(model, make_truth(model, rng, background), rng, FREE)
         value = posterior.log_prob(params) - posterior.log_prior(params)[0]
         relative.append(flux * (quadrature(posterior, params) - value))
-    assert abs(relative[0]) < 0.01  # faint
+    assert abs(relative[0]) < 0.03  # expanded: of the order of 1 / flux
     assert np.abs(relative).max() < 0.25
 
 
