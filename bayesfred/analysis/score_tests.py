@@ -173,7 +173,7 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
     ...     model.detector, model.sources, bf.GaussianPSF(2.1), model.distortion)
     >>> posterior = bf.Posterior(model, bf.simulate(wider, [1e-4], 2.0, seed=1))
     >>> first = score_tests(posterior, bf.find_map(posterior).params).leading[0]
-    >>> first.name, round(first.value + first.step, 1)
+    >>> first.name, round(float(first.value + first.step), 1)
     ('psf_sigma', 2.1)
     """
     model = replace(posterior.model, distortion=_with_more_terms(posterior.model.polynomial))
