@@ -45,7 +45,7 @@ def test_fluxes_are_drawn_from_their_posterior(x: tuple[float, ...], flux: float
     """Alone, and in pairs one width apart; 400 draws, refused in one of 1,000 if right."""
     target, params = posterior(x, flux), np.array([0.0, 1.0])
     rng = np.random.default_rng(7)
-    draws = np.array([draw_fluxes(target, params, rng) for _ in range(400)])
+    draws = np.array([draw_fluxes(target, params, range(len(x)), rng) for _ in range(400)])
     nodes = np.linspace(1e-3, 10.0 * flux if flux < 50.0 else 2.0 * flux, 240)
     density = weights(target, nodes)
     for s in range(len(x)):
@@ -66,7 +66,7 @@ def test_a_pair_is_anticorrelated() -> None:
     """The correlation of 400 draws has an error of 0.03; sources drawn apart have none."""
     target, params = posterior((-1.0, 1.0), 500.0), np.array([0.0, 1.0])
     rng = np.random.default_rng(3)
-    draws = np.array([draw_fluxes(target, params, rng) for _ in range(400)])
+    draws = np.array([draw_fluxes(target, params, range(2), rng) for _ in range(400)])
     nodes = np.linspace(1.0, 1000.0, 300)
     density = weights(target, nodes)
     density /= density.sum()
@@ -81,7 +81,7 @@ def test_fixed_fluxes_are_not_drawn() -> None:
     free = posterior((0.0,), 500.0)
     fixed = bf.Posterior(free.model, free.counts)
     with pytest.raises(InputError, match="expected free fluxes"):
-        draw_fluxes(fixed, np.array([0.0, 1.0]), np.random.default_rng(1))
+        draw_fluxes(fixed, np.array([0.0, 1.0]), [0], np.random.default_rng(1))
 
 
 def test_prior_predictive_frames_are_those_of_the_prior() -> None:

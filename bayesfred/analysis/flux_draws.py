@@ -7,27 +7,32 @@ their posterior is
 
 so draws of theta, each with one of F, are draws of the joint posterior. The density of one flux,
 given the others, has a single maximum. It is tabulated where it is not negligible, and drawn from
-by its distribution function. Sources that share no pixels are independent, so that one sweep over
-them is exact. Where some share pixels, the sweeps of this Gibbs sampler are repeated, from the most
-likely fluxes on.
+by its distribution function. Sources without light in common are independent, so that each is drawn
+beside the most likely fluxes of the others. Where some have more than `COUPLED` of it in common,
+all are drawn in turn, from the most likely fluxes on, and the sweeps of this Gibbs sampler are
+repeated.
 
 References
 ----------
 S. Geman, D. Geman (1984), IEEE Trans. Pattern Analysis 6, 721.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.model.kernels.sources import OwnPixels
 from bayesfred.model.posterior import Posterior
 
 __all__ = ["draw_fluxes"]
 
-SWEEPS = 20  # where sources share pixels
+SWEEPS = 20  # where sources share light
+COUPLED = (
+    0.03  # of a source's light squared; the variance of a flux is left too small by its square
+)
 NEGLIGIBLE = 25.0  # in log-density below the largest: e^-25 = 1e-11
 COARSE, FINE = 33, 201  # nodes, between which a density is linear
 CLOSE = 6  # of the coarse nodes at least are not negligible before it is tabulated finely
@@ -35,19 +40,23 @@ SMALLEST = 1e-6  # of the catalogue's flux
 NOTHING = 1e-300  # counts
 
 
-def draw_fluxes(posterior: Posterior, params: Floats, rng: np.random.Generator) -> Floats:
-    """Draw the fluxes of all sources, given the parameters.
+def draw_fluxes(
+    posterior: Posterior, params: Floats, sources: Sequence[int], rng: np.random.Generator
+) -> Floats:
+    """Draw the fluxes of some sources, given the parameters.
 
     Parameters
     ----------
     posterior : Posterior
         With free fluxes, and positions that are certain.
     params : ndarray, shape (d,)
+    sources : sequence of int, length n
+        Whose fluxes are wanted.
     rng : numpy.random.Generator
 
     Returns
     -------
-    ndarray, shape (s,), counts
+    ndarray, shape (n,), counts
 
     Raises
     ------
@@ -64,9 +73,9 @@ def draw_fluxes(posterior: Posterior, params: Floats, rng: np.random.Generator) 
     reach *= named.get("psf_sigma", psf.sigma) / psf.sigma
     own, expected, fluxes, _ = posterior.likelihood.own_pixels(params, reach)
     mean, counts, drawn = expected.ravel(), posterior.counts.ravel(), fluxes.copy()
-    shared = np.any(np.bincount(own.pixel, minlength=1) > 1)
-    for _ in range(SWEEPS if shared else 1):
-        for s in range(fluxes.size):
+    coupled = _coupling(own) > COUPLED
+    for _ in range(SWEEPS if coupled else 1):
+        for s in range(fluxes.size) if coupled else sources:
             some = slice(own.first[s], own.first[s + 1])
             pixel, template = own.pixel[some], own.templates[0, some] / fluxes[s]
             others = mean[pixel] - drawn[s] * template
@@ -88,7 +97,18 @@ def draw_fluxes(posterior: Posterior, params: Floats, rng: np.random.Generator) 
             new = _draw(log_density, (SMALLEST * prior.mean(), brightest), rng)
             mean[pixel] += (new - drawn[s]) * template
             drawn[s] = new
-    return drawn
+    return np.asarray(drawn[list(sources)])
+
+
+def _coupling(own: OwnPixels) -> float:
+    """The largest overlap of a source's light with that of all others, relative to its own."""
+    owner = np.repeat(np.arange(own.first.size - 1), np.diff(own.first))
+    light = own.templates[0]
+    shared, squared = (
+        np.bincount(owner, light * other, own.first.size - 1)
+        for other in (own.all_light - light, light)
+    )
+    return float(np.max(shared / np.maximum(squared, NOTHING), initial=0.0))
 
 
 def _draw(

@@ -133,7 +133,7 @@ class _Calibration:
         true = self._judged(posterior, truth[None])[0]
         if self._sources:
             some = list(self._sources)
-            light = np.array([draw_fluxes(posterior, each, rng)[some] for each in params])
+            light = np.array([draw_fluxes(posterior, each, some, rng) for each in params])
             drawn, true = np.hstack([drawn, light]), np.append(true, fluxes[some])
         if not (np.all(np.isfinite(drawn)) and np.all(np.isfinite(true))):
             raise InputError("displacement: got none at some point of the field, expected one")
