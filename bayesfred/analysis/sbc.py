@@ -149,10 +149,9 @@ class _Calibration:
 
     def truth(self, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
         """Parameters and fluxes from their priors, and a frame of theirs."""
-        likelihood = self.posterior.likelihood
         fluxes = self.posterior.model.sources.flux
         if self.posterior.nuisances.flux == "free":
-            fluxes = likelihood.flux_prior().rvs(random_state=rng)
+            fluxes = self.posterior.likelihood.draw_fluxes(rng)
         params, counts = drawn_from_prior(self.posterior, rng, fluxes)
         return params, fluxes, counts
 

@@ -208,6 +208,10 @@ class FrameLikelihood:
         shape = self.nuisances.flux_shape
         return stats.gamma(shape, scale=self._flux[which] / shape)
 
+    def draw_fluxes(self, rng: np.random.Generator) -> Floats:
+        """Free fluxes of all sources from their prior, shape (s,), counts."""
+        return np.asarray(self.flux_prior().rvs(self._flux.size, random_state=rng))
+
     def simulate(
         self, params: Floats, rng: np.random.Generator, fluxes: Floats | None = None
     ) -> Floats | None:
@@ -224,7 +228,7 @@ class FrameLikelihood:
         theta, nuisances, background = self._one(params)
         flux = nuisances.flux_scale * self._flux
         if self._free:
-            flux = self.flux_prior().rvs(random_state=rng) if fluxes is None else fluxes
+            flux = self.draw_fluxes(rng) if fluxes is None else fluxes
         ny, nx = self.model.detector.shape
         optics, out = self._optics, np.zeros(ny * stride(nx))
         at_rest = nuisances._replace(position_scatter=0.0)
