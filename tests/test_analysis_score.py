@@ -107,7 +107,7 @@ def judged(posterior: Posterior, start: Floats | None = None) -> tuple[FitVerdic
     best = find_map(posterior, start)
     residuals = judge_residuals(posterior, best.params, best.covariance)
     fit = fit_statistics(posterior, best.params)
-    return judge_fit(posterior, best.params, fit, residuals), residuals, consistent(fit)
+    return judge_fit(posterior, best, fit, residuals), residuals, consistent(fit)
 
 
 # --- exact ----------------------------------------------------------------------------------------

@@ -253,7 +253,7 @@ PRIOR = {
 def test_posteriors_of_400_faint_sources_are_calibrated(tmp_path: Path) -> None:
     # rejects exact posteriors in 1 of 100 cases; 30 frames notice a mean pull of 0.7
     posterior = replace(FAINT.posterior(np.ones((20 * CELL,) * 2)), prior=PRIOR)
-    result = bf.calibrate_posterior(
+    result = bf.simulation_based_calibration(
         posterior, replicates=30, path=tmp_path / "sbc.ecsv", seed=803, workers=1, progress=False
     )
     print(result.message, result.quantities["quantity"], result.quantities["pull"].round(2))
