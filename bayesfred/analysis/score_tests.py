@@ -202,7 +202,9 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
     prior = posterior.prior_information(params)[np.ix_(own, own)]
     pull = (posterior.gradient(params) - posterior.likelihood.gradient(params))[own]
 
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))  # powers of pixels differ
+    size = np.diag(information).copy()
+    size[fitted] += np.diag(prior)
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))  # powers of pixels differ
     theta = (information[np.ix_(fitted, fitted)] + prior) * np.outer(scale[fitted], scale[fitted])
     cross = information[np.ix_(fitted, others)] * np.outer(scale[fitted], scale[others])
     taken = np.linalg.solve(theta, cross)
