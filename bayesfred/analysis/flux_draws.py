@@ -34,7 +34,8 @@ COUPLED = (
     0.03  # of a source's light squared; the variance of a flux is left too small by its square
 )
 NEGLIGIBLE = 25.0  # in log-density below the largest: e^-25 = 1e-11
-COARSE, FINE = 33, 201  # nodes, between which a density is linear
+UNSEEN = 1e-4  # of the PSF's peak, where pixels tell nothing of a flux any more
+COARSE, FINE = 33, 101  # nodes, between which a density is linear
 CLOSE = 6  # of the coarse nodes at least are not negligible before it is tabulated finely
 SMALLEST = 1e-6  # of the catalogue's flux
 NOTHING = 1e-300  # counts
@@ -69,10 +70,11 @@ def draw_fluxes(
             "certain positions"
         )
     psf, named = posterior.model.psf, dict(zip(posterior.parameter_names, params, strict=True))
-    reach = psf.support_radius(posterior.model.tolerance)
+    reach = psf.support_radius(UNSEEN)
     reach *= named.get("psf_sigma", psf.sigma) / psf.sigma
     own, expected, fluxes, _ = posterior.likelihood.own_pixels(params, reach)
     mean, counts, drawn = expected.ravel(), posterior.counts.ravel(), fluxes.copy()
+    shape = posterior.nuisances.flux_shape
     coupled = _coupling(own) > COUPLED
     for _ in range(SWEEPS if coupled else 1):
         for s in range(fluxes.size) if coupled else sources:
@@ -80,21 +82,22 @@ def draw_fluxes(
             pixel, template = own.pixel[some], own.templates[0, some] / fluxes[s]
             others = mean[pixel] - drawn[s] * template
             noise = posterior.noise.at(np.unravel_index(pixel, posterior.counts.shape))
-            prior = posterior.likelihood.flux_prior(s)
+            mean_flux = float(posterior.model.sources.flux[s])
 
             def log_density(
                 flux: Floats,
                 n: Floats = counts[pixel],
                 noise: Any = noise,
                 linear: tuple[Floats, Floats] = (others, template),
-                prior: Any = prior,
+                mean_flux: float = mean_flux,
             ) -> Floats:
                 mu = np.maximum(linear[0] + flux[:, None] * linear[1], NOTHING)
                 likelihood = noise.log_likelihood(n, mu, named["background"]).sum(axis=1)
-                return np.asarray(likelihood + prior.logpdf(flux))
+                prior = (shape - 1.0) * np.log(flux) - shape * flux / mean_flux
+                return np.asarray(likelihood + prior)
 
-            brightest = 2.0 * (fluxes[s] + prior.mean()) + 10.0 * prior.std()
-            new = _draw(log_density, (SMALLEST * prior.mean(), brightest), rng)
+            brightest = 2.0 * fluxes[s] + 12.0 * mean_flux
+            new = _draw(log_density, (SMALLEST * mean_flux, brightest), rng)
             mean[pixel] += (new - drawn[s]) * template
             drawn[s] = new
     return np.asarray(drawn[list(sources)])
