@@ -99,6 +99,11 @@ CASES = {
     "scattered": Nuisances("free", position_scatter=True),
 }
 
+# what costs most to compile is among the long runs
+NAMES = [
+    pytest.param(name, marks=pytest.mark.long if name == "scattered" else ()) for name in CASES
+]
+
 
 def made(case: str, noise: Noise = OWN) -> tuple[Posterior, Floats]:
     """A frame with this noise and a tenth of its pixels masked, and the true parameters."""
@@ -127,7 +132,7 @@ def test_log_prob_is_that_of_the_dense_image() -> None:
     assert value == pytest.approx(float(terms.sum()), abs=1e-6)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", NAMES)
 def test_it_agrees_with_the_packages_own(case: str) -> None:
     posterior, params = made(case)
     own = Posterior(
@@ -161,7 +166,7 @@ def test_it_agrees_with_the_packages_own(case: str) -> None:
     assert abs(flat.log_prob(params) - posterior.log_prob(params)) > 10.0
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", NAMES)
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     posterior, truth = made(case)
     scale = errors(posterior, truth)

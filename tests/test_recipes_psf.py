@@ -159,9 +159,10 @@ def made(
     ("nuisances", "detector"),
     [
         (Nuisances("scale", offset=True, psf_sigma=True), Detector(SHAPE)),
-        (
+        pytest.param(
             Nuisances("free", psf_sigma=True, position_scatter=True),
             Detector((30, 37), 2, "box"),
+            marks=pytest.mark.long,
         ),
     ],
     ids=["scale", "free, scattered, box"],
