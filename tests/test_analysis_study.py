@@ -555,6 +555,8 @@ def small(
         name: stats.norm(0.0, widen * TIGHT * np.sqrt(1000.0 / flux)) for name in ("f_vx", "g_uy")
     }
     prior["background"] = stats.gamma(4.0, scale=background / 4.0)
+    if psf_sigma:
+        prior["psf_sigma"] = stats.norm(2.0, 0.15)
     frame = model.expected_counts(np.zeros(4), background)
     return bf.Posterior(
         model, frame, prior=prior,

@@ -29,7 +29,7 @@ from bayesfred.model.posterior import Posterior
 
 __all__ = ["draw_fluxes"]
 
-SWEEPS = 20  # where sources share light
+SWEEPS = 10  # where sources share light
 COUPLED = (
     0.03  # of a source's light squared; the variance of a flux is left too small by its square
 )
