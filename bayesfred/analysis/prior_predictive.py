@@ -75,19 +75,17 @@ def prior_predictive(posterior: Posterior, draws: int, *, seed: int) -> PriorPre
     if draws < 1:
         raise InputError(f"prior: draws: got {draws}, expected at least 1")
     rng = np.random.default_rng(seed)
-    drawn = [_draw(posterior, rng, None) for _ in range(draws)]
-    refused = sum(again for _, _, again in drawn)
-    return PriorPredictive(
-        np.array([params for params, _, _ in drawn]),
-        np.array([counts for _, counts, _ in drawn]),
-        refused / (refused + draws),
+    params, counts, refused = zip(
+        *(drawn_from_prior(posterior, rng) for _ in range(draws)), strict=True
     )
+    again = sum(refused)
+    return PriorPredictive(np.array(params), np.array(counts), again / (again + draws))
 
 
 def drawn_from_prior(
     posterior: Posterior, rng: np.random.Generator, fluxes: Floats | None = None
-) -> tuple[Floats, Floats]:
-    """Parameters from the prior, shape (d,), and a frame of theirs, shape (ny, nx).
+) -> tuple[Floats, Floats, int]:
+    """Draw parameters from the prior until they give a frame.
 
     Parameters
     ----------
@@ -100,23 +98,19 @@ def drawn_from_prior(
     -------
     params : ndarray, shape (d,)
     counts : ndarray, shape (ny, nx)
+    refused : int
+        How many were drawn before.
 
     Raises
     ------
     InputError
         If 1,000 draws in a row all fold.
     """
-    return _draw(posterior, rng, fluxes)[:2]
-
-
-def _draw(
-    posterior: Posterior, rng: np.random.Generator, fluxes: Floats | None
-) -> tuple[Floats, Floats, int]:
-    for again in range(REDRAWS):
+    for refused in range(REDRAWS):
         params = np.array([prior.rvs(random_state=rng) for prior in posterior.prior.values()])
         counts = posterior.simulate(params, rng, fluxes)
         if counts is not None:
-            return params, counts, again
+            return params, counts, refused
     raise InputError(
         f"prior: got {REDRAWS} draws that all fold a source's image, expected some that do not: "
         "narrow it"

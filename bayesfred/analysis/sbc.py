@@ -152,7 +152,7 @@ class _Calibration:
         fluxes = self.posterior.model.sources.flux
         if self.posterior.nuisances.flux == "free":
             fluxes = self.posterior.likelihood.draw_fluxes(rng)
-        params, counts = drawn_from_prior(self.posterior, rng, fluxes)
+        params, counts, _ = drawn_from_prior(self.posterior, rng, fluxes)
         return params, fluxes, counts
 
     def _judged(self, posterior: Posterior, params: Floats) -> Floats:

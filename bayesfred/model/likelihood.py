@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
@@ -203,14 +202,10 @@ class FrameLikelihood:
         level = self._background(parameters.background)
         return own, sources + level, fluxes, shifts
 
-    def flux_prior(self, which: int | slice = slice(None)) -> Any:
-        """The prior of the fluxes of some sources, where they are free, counts."""
-        shape = self.nuisances.flux_shape
-        return stats.gamma(shape, scale=self._flux[which] / shape)
-
     def draw_fluxes(self, rng: np.random.Generator) -> Floats:
         """Free fluxes of all sources from their prior, shape (s,), counts."""
-        return np.asarray(self.flux_prior().rvs(self._flux.size, random_state=rng))
+        shape = self.nuisances.flux_shape
+        return self._flux * rng.gamma(shape, 1.0 / shape, self._flux.size)
 
     def simulate(
         self, params: Floats, rng: np.random.Generator, fluxes: Floats | None = None
