@@ -62,19 +62,23 @@ def test_fluxes_are_drawn_from_their_posterior(x: tuple[float, ...], flux: float
             )
 
 
-def test_a_pair_is_anticorrelated() -> None:
-    """The correlation of 400 draws has an error of 0.03; sources drawn apart have none."""
-    target, params = posterior((-1.0, 1.0), 500.0), np.array([0.0, 1.0])
-    rng = np.random.default_rng(3)
-    draws = np.array([draw_fluxes(target, params, range(2), rng) for _ in range(400)])
-    nodes = np.linspace(1.0, 1000.0, 300)
+def test_a_close_pair_needs_several_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a width apart. Of 400 draws a standard deviation has an error of 3.5 %."""
+    target, params = posterior((-0.5, 0.5), 500.0), np.array([0.0, 1.0])
+    nodes = np.linspace(1.0, 1200.0, 300)
     density = weights(target, nodes)
-    density /= density.sum()
     a, b = np.meshgrid(nodes, nodes, indexing="ij")
-    cov = np.cov(np.stack([a.ravel(), b.ravel()]), aweights=density.ravel())
-    exact = cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1])
-    assert exact < -0.5
-    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(exact, abs=0.12)
+    exact = np.cov(np.stack([a.ravel(), b.ravel()]), aweights=density.ravel())
+    rng, found = np.random.default_rng(3), {}
+    for sweeps in (10, 1):  # the second is the negative control
+        monkeypatch.setattr("bayesfred.analysis.flux_draws.SWEEPS", sweeps)
+        draws = np.array([draw_fluxes(target, params, range(2), rng) for _ in range(400)])
+        found[sweeps] = np.cov(draws.T)
+    assert exact[0, 1] < -0.8 * np.sqrt(exact[0, 0] * exact[1, 1])
+    ratio = {k: np.sqrt(np.diag(each) / np.diag(exact)) for k, each in found.items()}
+    assert np.all(np.abs(ratio[10] - 1.0) < 4.0 * 0.035)
+    assert found[10][0, 1] == pytest.approx(exact[0, 1], rel=4.0 * 0.07)
+    assert ratio[1][0] < 1.0 - 4.0 * 0.035
 
 
 def test_fixed_fluxes_are_not_drawn() -> None:
@@ -103,12 +107,14 @@ def test_prior_predictive_frames_are_those_of_the_prior() -> None:
 
 
 def test_a_prior_that_folds_is_said_so() -> None:
-    """Where |f_ux| exceeds 1 / 6, of 400 and more draws within 4 standard errors."""
+    """Where |f_ux| exceeds 1 / 6, of 1,600 draws and more within 4 standard errors."""
     free = posterior((-6.0, 6.0), 500.0)
     wide = bf.Posterior(free.model, free.counts, prior={"f_ux": stats.norm(0.0, 0.1)})
     folding = 2.0 * stats.norm.cdf(-1.0 / 6.0, scale=0.1)
-    error = np.sqrt(folding * (1.0 - folding) / 400.0)
-    assert bf.prior_predictive(wide, 400, seed=1).refused == pytest.approx(folding, abs=4.0 * error)
+    error = np.sqrt(folding * (1.0 - folding) / 1600.0)
+    assert bf.prior_predictive(wide, 1600, seed=1).refused == pytest.approx(
+        folding, abs=4.0 * error
+    )
     folded = bf.Posterior(free.model, free.counts, prior={"f_ux": stats.norm(-0.5, 0.01)})
     with pytest.raises(InputError, match="all fold"):
         bf.prior_predictive(folded, 1, seed=1)

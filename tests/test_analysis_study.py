@@ -607,6 +607,18 @@ def test_truth_is_ranked_among_the_draws(tmp_path: Path) -> None:
     assert np.random.default_rng(for_ranks).random(1).size == 1
 
 
+def test_fluxes_are_ranked_among_their_own_draws() -> None:
+    """The true ones are those of the frame; draws know them to some 4 %, the prior to 71 %."""
+    posterior = small(free=True)
+    study = sbc._Calibration(posterior, posterior, "laplace", 1)
+    row = dict(zip(study.columns, study.task(2), strict=True))
+    _, fluxes, _ = study.truth(np.random.default_rng(seeds(1, 2).spawn(3)[0]))
+    for s in (0, 4, 8):
+        assert row[f"flux({s}).truth"] == fluxes[s]
+        assert abs(row[f"flux({s}).mean"] - fluxes[s]) < 5.0 * row[f"flux({s}).sd"]
+        assert row[f"flux({s}).sd"] < 0.3 * fluxes[s]
+
+
 def test_draws_of_the_laplace_approximation_are_ranked_too(tmp_path: Path) -> None:
     """With hardly any background the normal approximation extends below zero.
 
