@@ -17,7 +17,7 @@ from bayesfred.io.catalogues import read_catalogue
 from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
 from bayesfred.model import priors
-from bayesfred.model.noise import simulate
+from bayesfred.model.noise import Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
@@ -59,7 +59,7 @@ def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
     if not arrays:
         return cast(PSF, run.psf.make())
     path = resolve(run.psf.path, run_file, must_exist=True)
-    image = read_frame(path, gain=1.0)
+    image = read_frame(path, gain=1.0, pedestal=0.0, saturation=math.inf)
     if image.n_masked:
         raise InputError(
             f"{path}: got {image.n_masked} pixels that are not finite, expected samples of a PSF: "
@@ -88,18 +88,32 @@ def priors_given(run: settings.RunSettings) -> dict[str, Any]:
     return {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
 
 
+def noise_given(run: settings.RunSettings, read_noise: float | None) -> tuple[Noise, str]:
+    """The noise of [noise], and a line of what becomes of the read noise in a frame's header.
+
+    Where [noise] does not say a read noise, it is the header's.
+    """
+    noise: Noise = run.noise.make()
+    if not read_noise or getattr(noise, "read_noise", None) == read_noise:
+        return noise, ""
+    if isinstance(noise, PoissonNoise) and "read_noise" not in run.noise.model_fields_set:
+        return PoissonNoise(read_noise), f"read noise: {read_noise:g} e-, from the header"
+    return noise, f"read noise: {read_noise:g} e- of the header not used, as [noise] says the noise"
+
+
 def posterior_given(
     run: settings.RunSettings,
     model: ForwardModel,
     counts: Floats,
     mask: Flags | None,
+    noise: Noise,
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
     return Posterior(
         model,
         counts,
         prior=priors_given(run),
-        noise=run.noise.make(),
+        noise=noise,
         mask=mask,
         nuisances=run.nuisances.make(),
     )
@@ -134,7 +148,7 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
     theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
     noise = run.noise.make()
     counts = simulate(model, theta, s.background, seed=seed, noise=noise)
-    posterior = posterior_given(run, model, counts, None)
+    posterior = posterior_given(run, model, counts, None, noise)
     known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
     known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
     truth = np.array([known.get(name, 0.0) for name in posterior.parameter_names])

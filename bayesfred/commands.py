@@ -104,7 +104,7 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
     simulation = build.simulation(run, run_file)
-    if run.frame.gain is not None or run.frame.pedestal != 0.0:
+    if run.frame.gain is not None or run.frame.pedestal:
         raise InputError(
             f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts "
             "are written: remove them"

@@ -120,13 +120,16 @@ def read_frame(
         path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
     note(frame.description)
+    noise, line = build.noise_given(run, frame.read_noise)
+    if line:
+        note(line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = build.reference_psf(run, run_file)
     sources, census = build.catalogue(run, run_file, shape, psf)
     note(census)
     with naming(run_file):
         model = build.forward_model(run, shape, sources, psf)
-        posterior = build.posterior_given(run, model, frame.counts, frame.valid)
+        posterior = build.posterior_given(run, model, frame.counts, frame.valid, noise)
         estimate = None
         if f.reject_outliers:
             with searching() if say else nullcontext():

@@ -52,11 +52,11 @@ class FrameSettings(Section):
     path : str
         The frame's file.
     gain : float, optional, e-/adu
-        Counts are (stored - pedestal) * gain.
-    pedestal : float, stored units
-        Level that no light would give.
+        Counts are (stored - pedestal) * gain; by default the header's.
+    pedestal : float, optional, stored units
+        Level that no light would give, by default 0.
     saturation : float, optional, stored units
-        Pixels at or above this level are masked.
+        Pixels at or above this level are masked; by default the header's, or what seems saturated.
     name : str, optional
         FITS extension or HDF5 dataset.
     reject_outliers : bool
@@ -66,7 +66,7 @@ class FrameSettings(Section):
 
     path: Name
     gain: _Positive | None = None
-    pedestal: Float = 0.0
+    pedestal: Float | None = None
     saturation: Float | None = None
     name: Name | None = None
     reject_outliers: bool = False

@@ -185,7 +185,7 @@ def test_hdf5_dataset_by_name(tmp_path: Path) -> None:
         ({"gain": 0.0}, "gain: got 0.0, expected a positive number"),
         ({"gain": np.inf}, "gain: got inf"),
         ({"pedestal": np.nan}, "pedestal: got nan, expected a finite number"),
-        ({"saturation": np.inf}, "saturation: got inf, expected a finite number"),
+        ({"saturation": np.nan}, "saturation: got nan, expected a level in stored units"),
         ({"saturation": 0.0}, "got every pixel masked (35 saturated), expected some"),
         ({"name": "counts"}, "got name 'counts', expected none"),
     ],
@@ -590,7 +590,12 @@ def test_star_tracker_frames(name: str) -> None:
     np.testing.assert_allclose(
         frame.counts[frame.valid], (stored[frame.valid] + 10) * 2.72, rtol=1e-14
     )
-    np.testing.assert_array_equal(read_frame(DATA / f"{name}.fits").counts, stored)
+    assert "PEDESTAL: got -10 in the header" in message(read_frame, DATA / f"{name}.fits")
+    found = read_frame(DATA / f"{name}.fits", pedestal=-10.0)  # the gain is the header's
+    np.testing.assert_array_equal(found.valid, stored < 4096)  # a plateau of 11 pixels, or 3
+    np.testing.assert_array_equal(found.counts, frame.counts)
+    assert "saturation suspected at the maximum of 4096" in found.description
+    assert "gain 2.72 (GAIN)" in found.description
     stars = read_catalogue(DATA / f"{name}.csv", magnitude="mag", zero_point=20.0)
     assert np.abs(stars.x).max() < 512
     assert np.abs(stars.y).max() < 384

@@ -54,7 +54,7 @@ def is_section(kind: Any) -> bool:
 def test_defaults(tmp_path: Path) -> None:
     settings = read(tmp_path)
     assert settings.model_dump(exclude_none=True) == {
-        "frame": {"path": "frame.fits", "pedestal": 0.0, "reject_outliers": False},
+        "frame": {"path": "frame.fits", "reject_outliers": False},
         "catalogue": {"path": "stars.csv", "x": "x", "y": "y", "flux": "flux"},
         "detector": {"pixel": "impulse", "binning": 1},
         "psf": {"kind": "gaussian", "sigma": 2.0},

@@ -11,7 +11,6 @@ import gzip
 import io
 import math
 import os
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,14 +19,16 @@ from typing import Any
 import h5py
 import numpy as np
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import ArrayLike
 
 from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.errors import InputError, printable
 from bayesfred.io.atomic import replace
+from bayesfred.io.fits_images import StoredImage, read_fits
+from bayesfred.io.headers import calibration
 from bayesfred.io.paths import may_write
 from bayesfred.io.reading import readable, require_file
+from bayesfred.io.saturation import plateau
 
 __all__ = ["LARGEST_COUNT", "FrameRecord", "read_frame", "require_memory", "write_frame"]
 
@@ -60,20 +61,24 @@ class FrameRecord:
     n_masked : int
         Number of pixels that are not valid.
     description : str
-        One line: the file, its shape, how many pixels are masked and why.
+        One line: the file, its shape, how many pixels are masked and why, and what was taken from
+        its header or not.
+    read_noise : float or None, e-
+        As a FITS header has it.
     """
 
     counts: Floats
     valid: Flags
     n_masked: int
     description: str
+    read_noise: float | None = None
 
 
 def read_frame(
     path: PathLike,
     *,
     gain: float | None = None,
-    pedestal: float = 0.0,
+    pedestal: float | None = None,
     saturation: float | None = None,
     name: str | None = None,
 ) -> FrameRecord:
@@ -85,12 +90,16 @@ def read_frame(
         A FITS (.fits .fit .fts, also followed by .gz or .fz), HDF5 (.h5 .hdf5) or NumPy (.npy)
         file.
     gain : float, optional, e-/adu
-        Counts are (stored - pedestal) * gain. Without a gain the stored numbers, less the pedestal,
-        must be counts already: whole and not negative.
-    pedestal : float, stored units
-        Level that no light would give.
+        Counts are (stored - pedestal) * gain. By default a FITS header's EGAIN or GAIN, or 1 where
+        its BUNIT is electrons. Without a gain the stored numbers, less the pedestal, must be counts
+        already: whole and not negative.
+    pedestal : float, optional, stored units
+        Level that no light would give, by default 0. A header's PEDESTAL is refused, as programs
+        differ in its sign.
     saturation : float, optional, stored units
-        Pixels at or above this level are masked.
+        Pixels at or above this level are masked. By default a header's SATURATE; without one, the
+        pixels at the frame's maximum if there are so many that it looks like a plateau. Infinity
+        masks none.
     name : str, optional
         FITS extension or HDF5 dataset. By default the first 2-D image of a FITS file, and `counts`
         in an HDF5 file.
@@ -98,14 +107,16 @@ def read_frame(
     Returns
     -------
     FrameRecord
-        Pixels that hold NaN or infinity, or that are saturated, are masked. With a gain, read noise
-        may leave counts below zero. They are kept.
+        Pixels that hold NaN or infinity, that are or seem saturated, or that a FITS extension (DQ,
+        MASK, BPM) flags are masked. With a gain, read noise may leave counts below zero. They are
+        kept.
 
     Raises
     ------
     InputError
-        The file is missing, damaged or of another kind; it holds no such image; a fit of it would
-        not fit in memory; its numbers are not counts and no gain is given; no pixel is left.
+        The file is missing, damaged or of another kind; a checksum is wrong; it holds no such
+        image; a fit of it would not fit in memory; its numbers are not counts and no gain is given;
+        its header cannot be taken at its word; no pixel is left.
 
     Examples
     --------
@@ -120,37 +131,51 @@ def read_frame(
     kind = _format(path)
     if gain is not None and not (math.isfinite(gain) and gain > 0):
         raise InputError(f"{path}: gain: got {gain}, expected a positive number of e-/adu")
-    for label, level in (("pedestal", pedestal), ("saturation", saturation)):
-        if level is not None and not math.isfinite(level):
-            raise InputError(
-                f"{path}: {label}: got {level}, expected a finite number in stored units"
-            )
+    if pedestal is not None and not math.isfinite(pedestal):
+        raise InputError(
+            f"{path}: pedestal: got {pedestal}, expected a finite number in stored units"
+        )
+    if saturation is not None and not saturation > -math.inf:
+        raise InputError(f"{path}: saturation: got {saturation}, expected a level in stored units")
     require_file(path)
-    stored = _READERS[kind](path, name)
+    image = _READERS[kind](path, name)
+    stored = image.stored
+    known = calibration(path, image.header, gain=gain, pedestal=pedestal, saturation=saturation)
+    notes = [*known.notes, *(f"{unused} not used" for unused in image.unused)]
 
     finite = np.isfinite(stored)
-    saturated = finite & (stored >= (np.inf if saturation is None else saturation))
-    valid = finite & ~saturated
-    masks = {"NaN": np.isnan(stored), "infinite": np.isinf(stored), "saturated": saturated}
+    masks = {"NaN": np.isnan(stored), "infinite": np.isinf(stored)}
+    masks |= {f"flagged in {flagging}": flags for flagging, flags in image.flags.items()}
+    level, why = known.saturation, "saturated"
+    if level is None:
+        level, why = plateau(stored[finite]), "suspected of saturation"
+        if level is not None:
+            notes.append(
+                f"saturation suspected at the maximum of {level:.9g}: give a higher saturation if "
+                "that is wrong"
+            )
+    if level is not None:
+        masks[why] = finite & (stored >= level)
+    valid = ~np.any(list(masks.values()), axis=0)
     reasons = ", ".join(f"{mask.sum()} {reason}" for reason, mask in masks.items() if mask.any())
     if not valid.any():
         raise InputError(f"{path}: got every pixel masked ({reasons}), expected some to use")
 
     with np.errstate(over="ignore"):
-        counts = (np.where(valid, stored, pedestal) - pedestal) * (1.0 if gain is None else gain)
+        counts = np.where(valid, stored, known.pedestal) - known.pedestal
+        counts *= 1.0 if known.gain is None else known.gain
     _refuse(
         path,
         counts,
         np.abs(counts) > LARGEST_COUNT,
         f"counts of at most {LARGEST_COUNT:.0e}; check gain and pedestal",
     )
-    if gain is None:
+    if known.gain is None:
         counts = _require_counts(path, counts)
     n_masked = int(valid.size - valid.sum())
     masked = f"{n_masked} masked ({reasons})" if n_masked else "none masked"
-    return FrameRecord(
-        counts, valid, n_masked, f"{printable(path.name)}: {_by(stored.shape)} pixels, {masked}"
-    )
+    said = "; ".join([f"{_by(stored.shape)} pixels, {masked}", *notes])
+    return FrameRecord(counts, valid, n_masked, f"{printable(path.name)}: {said}", known.read_noise)
 
 
 def write_frame(path: PathLike, counts: ArrayLike, *, overwrite: bool = False) -> None:
@@ -244,43 +269,11 @@ def _require_image(
         raise InputError(f"{where}: got values of type {dtype}, expected real numbers")
 
 
-class _Stream(io.BufferedReader):
-    """A file in which a seek beyond the end, as absurd headers ask for, goes to the end."""
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        return super().seek(min(offset, os.fstat(self.fileno()).st_size), whence)
+def _read_fits(path: Path, name: str | None) -> StoredImage:
+    return read_fits(path, name, require_memory)
 
 
-def _read_fits(path: Path, name: str | None) -> Floats:
-    seen = []
-    with readable(path, "FITS"), warnings.catch_warnings():
-        # Warnings are about headers; data that are cut short raise.
-        warnings.simplefilter("ignore", AstropyWarning)
-        zipped = path.suffix.lower() == ".gz"
-        # uint=False: as unsigned integers BLANK pixels would come through as ordinary numbers.
-        with (
-            gzip.open(path) if zipped else _Stream(io.FileIO(path)) as stream,
-            fits.open(stream, memmap=False, uint=False) as hdus,
-        ):
-            for index, hdu in enumerate(hdus):
-                if not hdu.is_image:
-                    continue
-                seen.append(f"{hdu.name or index} {_by(hdu.shape) or 'without data'}")
-                if (
-                    len(hdu.shape) == 2
-                    and min(hdu.shape) > 0
-                    and (name or hdu.name).upper() == hdu.name
-                ):
-                    require_memory(f"{path}: {hdu.name or index}", hdu.shape)
-                    image = np.asarray(hdu.data, dtype=np.float64)
-                    while zipped and stream.read(1 << 20):
-                        pass  # up to the checksum, which astropy does not reach
-                    return image
-    wanted = "a 2-D image" if name is None else f"a 2-D image in extension {name!r}"
-    raise InputError(f"{path}: got {', '.join(seen) or 'no image'}, expected {wanted}")
-
-
-def _read_hdf5(path: Path, name: str | None) -> Floats:
+def _read_hdf5(path: Path, name: str | None) -> StoredImage:
     key = name or "counts"
     with readable(path, "HDF5"), h5py.File(path, "r") as file:
         dataset = file.get(key)
@@ -296,10 +289,10 @@ def _read_hdf5(path: Path, name: str | None) -> Floats:
                 "copy it"
             )
         require_memory(f"{path}: {key}", dataset.shape)
-        return np.asarray(dataset[()], dtype=np.float64)
+        return StoredImage(np.asarray(dataset[()], dtype=np.float64))
 
 
-def _read_npy(path: Path, name: str | None) -> Floats:
+def _read_npy(path: Path, name: str | None) -> StoredImage:
     if name is not None:
         raise InputError(
             f"{path}: got name {name!r}, expected none, as an NPY file holds one array"
@@ -310,10 +303,10 @@ def _read_npy(path: Path, name: str | None) -> Floats:
         stored = np.lib.format.open_memmap(path, mode="r")
         _require_image(path, stored.shape, stored.dtype)
         require_memory(f"{path}", stored.shape)
-        return np.array(stored, dtype=np.float64)
+        return StoredImage(np.array(stored, dtype=np.float64))
 
 
-_READERS: dict[str, Callable[[Path, str | None], Floats]] = {
+_READERS: dict[str, Callable[[Path, str | None], StoredImage]] = {
     "FITS": _read_fits,
     "HDF5": _read_hdf5,
     "NPY": _read_npy,

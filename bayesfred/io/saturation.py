@@ -1,0 +1,55 @@
+"""Saturation suspected from a frame alone: a plateau at its maximum.
+
+Stored numbers come in steps, and their density falls towards the maximum M or is flat there: a
+star's profile passes through all levels up to its peak. Of the pixels in the w levels below M and
+at it, each then lies at M with a probability of at most 1/w. So beside the one that makes M the
+maximum, n others in these levels put more than k at M with at most the binomial probability, and
+where that is tiny, the levels end at M because the detector does.
+"""
+
+import numpy as np
+from scipy.special import bdtrc
+
+from bayesfred._typing import Floats
+
+__all__ = ["plateau"]
+
+CHANCE = 1e-3  # of suspecting a frame without saturated pixels, at most
+TOP = 0.1  # share of the range, from the median to the maximum, that is compared with the maximum
+FULL_SCALE = (4095.0, 16383.0, 32767.0, 65535.0)  # of which one pixel is suspect
+SAMPLE = 10**5  # pixels in which the steps are looked for
+
+
+def plateau(stored: Floats) -> float | None:
+    """The level at which pixels look saturated; None where none do.
+
+    Parameters
+    ----------
+    stored : ndarray, shape (n,), stored units; finite
+
+    Returns
+    -------
+    float or None, stored units
+
+    Examples
+    --------
+    >>> counts = np.random.default_rng(1).poisson(10.0 + 3000.0 * np.linspace(0.0, 1.0, 1000) ** 9)
+    >>> plateau(counts), plateau(np.minimum(counts, 2500))
+    (None, 2500.0)
+    """
+    if not stored.size:
+        return None
+    top = float(stored.max())
+    if top in FULL_SCALE:
+        return top
+    steps = np.diff(np.unique(stored[:: max(1, stored.size // SAMPLE)]))
+    if not steps.size:
+        return None
+    levels = int(TOP * (top - float(np.median(stored))) / float(steps.min()))
+    if levels < 2:
+        return None
+    others = int(np.sum(stored > top - levels * steps.min())) - 1
+    more = int(np.sum(stored == top)) - 1
+    if more and bdtrc(more - 1, others, 1.0 / levels) < CHANCE:
+        return top
+    return None
