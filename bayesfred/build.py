@@ -14,11 +14,12 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF
 from bayesfred.io.catalogues import read_catalogue
-from bayesfred.io.frames import read_frame, require_memory
+from bayesfred.io.frames import FrameRecord, read_frame, require_memory
 from bayesfred.io.paths import resolve
 from bayesfred.model import priors
 from bayesfred.model.noise import Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.peaks import typical_flux
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
 # deviations of a term's default prior. Sources whose light is farther from the frame than that are
@@ -27,17 +28,24 @@ STRAY = 0.3
 
 
 def catalogue(
-    run: settings.RunSettings, run_file: Path, shape: tuple[int, int], psf: PSF
+    run: settings.RunSettings,
+    run_file: Path,
+    shape: tuple[int, int],
+    psf: PSF,
+    frame: FrameRecord | None = None,
 ) -> tuple[SourceCatalog, str]:
     """The catalogue's sources whose light can reach the frame, and a line that counts them.
 
     A source is at the edge if the frame's border is within three widths of the PSF, or between it
     and the frame; and outside if no light reaches the frame from an image that stands `STRAY`
-    nearer. If all are outside, all are kept: the posterior says so.
+    nearer. If all are outside, all are kept: the posterior says so. Where fluxes are free and the
+    catalogue has none, all begin at the mean flux of the frame's brightest peaks.
     """
     c, path = run.catalogue, resolve(run.catalogue.path, run_file, must_exist=True)
+    free = frame is not None and run.nuisances.flux == "free"
+    column = None if free and "flux" not in c.model_fields_set else c.flux
     record = read_catalogue(
-        path, x=c.x, y=c.y, flux=c.flux, magnitude=c.magnitude, zero_point=c.zero_point
+        path, x=c.x, y=c.y, flux=column, magnitude=c.magnitude, zero_point=c.zero_point
     )
     half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
     beyond = np.abs([record.x, record.y]) - half  # pixels, negative inside
@@ -48,9 +56,14 @@ def catalogue(
         f"{len(record.x)} sources, {at_edge.sum()} at the frame's edge, {(~kept).sum()} "
         "outside removed"
     )
-    return SourceCatalog(
-        record.x[kept], record.y[kept], record.flux[kept]
-    ), f"{printable(path.name)}: {numbers}"
+    flux = record.flux
+    if frame is not None and np.isnan(flux).all():
+        width = math.hypot(psf.sigma / run.detector.binning, 12.0**-0.5)
+        inside = int((beyond < 0.0).all(axis=0).sum())
+        flux = np.full_like(flux, typical_flux(frame.counts, frame.valid, width, max(inside, 1)))
+        numbers += f"; without fluxes, which are free and begin at {flux[0]:.3g} counts"
+    sources = SourceCatalog(record.x[kept], record.y[kept], flux[kept])
+    return sources, f"{printable(path.name)}: {numbers}"
 
 
 def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:

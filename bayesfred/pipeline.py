@@ -125,7 +125,7 @@ def read_frame(
         note(line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = build.reference_psf(run, run_file)
-    sources, census = build.catalogue(run, run_file, shape, psf)
+    sources, census = build.catalogue(run, run_file, shape, psf, frame)
     note(census)
     with naming(run_file):
         model = build.forward_model(run, shape, sources, psf)

@@ -82,7 +82,7 @@ class CatalogueSettings(Section):
     x, y : str
         Columns of the positions, pixel from the middle of the frame.
     flux : str
-        Column of the fluxes, counts.
+        Column of the fluxes, counts; not needed where [nuisances] has them free.
     magnitude : str, optional
         Column of magnitudes, in place of fluxes.
     zero_point : float, optional

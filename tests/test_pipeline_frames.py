@@ -57,3 +57,31 @@ def test_read_noise_of_the_header(
     assert said or not any("read noise" in note for note in notes)
     assert "gain 2 (GAIN)" in notes[0]
     np.testing.assert_allclose(np.median(posterior.counts), 50.0, atol=2.0)
+
+
+def test_free_fluxes_need_no_column(tmp_path: Path) -> None:
+    run = write(tmp_path, '[nuisances]\nflux = "free"')
+    _, estimate = fitted(run)
+    lines = (tmp_path / "stars.csv").read_text().splitlines()
+    (tmp_path / "stars.csv").write_text("\n".join(line.rsplit(",", 1)[0] for line in lines))
+    posterior, _, notes = pipeline.read_frame(read_settings(run), run, None)
+    assert "without fluxes, which are free and begin at" in notes[1]
+    # to the scatter of the brightest of noisy peaks
+    np.testing.assert_allclose(posterior.model.sources.flux, 1e4, rtol=0.1)
+    found = bf.find_map(posterior)
+    sd = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(found.params - estimate.params) < 0.05 * sd)
+    # negative control: fluxes that are not free are needed, and so is a column that was asked for
+    for extra in ('flux = "scale"', 'flux = "fixed"'):
+        (tmp_path / "run.toml").write_text(RUN + f"[nuisances]\n{extra}")
+        with pytest.raises(bf.InputError, match="got no column 'flux', expected one of: 'x', 'y'"):
+            fitted(run)
+    asked = RUN.replace('"stars.csv"', '"stars.csv"\nflux = "F"') + '[nuisances]\nflux = "free"'
+    (tmp_path / "run.toml").write_text(asked)
+    with pytest.raises(bf.InputError, match="got no column 'F'"):
+        fitted(run)
+
+
+def fitted(run: Path) -> tuple[bf.Posterior, bf.MapEstimate]:
+    posterior, _, _ = pipeline.read_frame(read_settings(run), run, None)
+    return posterior, bf.find_map(posterior)

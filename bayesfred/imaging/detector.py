@@ -21,6 +21,7 @@ from scipy.special import sici
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 
 PIXELS = ("impulse", "box")
@@ -254,7 +255,7 @@ def correct_sampling(frame: ArrayLike) -> Floats:
     ----------
     Sun & Zhou, appendix A and Fig. 4.
     """
-    values = np.asarray(frame, dtype=np.float64)
+    values, _ = frame_given(frame)  # not finite where it is masked
     if values.ndim != 2 or values.size == 0:
         raise InputError(f"frame: got shape {values.shape}, expected two dimensions (ny, nx)")
     if not np.isfinite(values).all():

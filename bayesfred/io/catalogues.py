@@ -38,7 +38,7 @@ class CatalogueRecord:
     x, y : ndarray, shape (n,), pixel
         Undistorted positions from the middle of the frame, x along columns and y along rows.
     flux : ndarray, shape (n,), counts
-        Expected counts of each source over the whole of its image.
+        Expected counts of each source over the whole of its image; nan where the file has none.
     """
 
     x: Floats
@@ -51,7 +51,7 @@ def read_catalogue(
     *,
     x: str = "x",
     y: str = "y",
-    flux: str = "flux",
+    flux: str | None = "flux",
     magnitude: str | None = None,
     zero_point: float | None = None,
 ) -> CatalogueRecord:
@@ -63,8 +63,9 @@ def read_catalogue(
         A .csv or .ecsv file with one row a source.
     x, y : str
         Columns of the positions (pixel, from the middle of the frame).
-    flux : str
-        Column of the fluxes (counts); ignored where `magnitude` is given.
+    flux : str or None
+        Column of the fluxes (counts); ignored where `magnitude` is given. None where fluxes are not
+        needed: they are nan unless there is a column `flux`.
     magnitude : str, optional
         Column of magnitudes, from which flux = 10**(-0.4 (magnitude - zero_point)).
     zero_point : float, optional
@@ -107,14 +108,17 @@ def read_catalogue(
             f"{path}: got an empty catalogue, expected a heading and at least one source"
         )
 
-    columns = [_column(path, table, column) for column in (x, y, magnitude or flux)]
+    light = magnitude or flux or ("flux" if "flux" in table.colnames else None)
+    columns = [_column(path, table, column) for column in (x, y, light) if column is not None]
+    if light is None:
+        columns.append(np.full(len(table), np.nan))
     if magnitude is not None and zero_point is not None:
         with np.errstate(over="ignore", under="ignore"):
             columns[2] = 10.0 ** (-0.4 * (columns[2] - zero_point))
     record = CatalogueRecord(*columns)
     bad = np.flatnonzero(~((record.flux > 0) & (record.flux <= LARGEST_COUNT)))
-    if bad.size:
-        where = f"row {bad[0] + 1}, column {magnitude or flux!r}"
+    if bad.size and light is not None:
+        where = f"row {bad[0] + 1}, column {light!r}"
         got = f"a flux of {record.flux[bad[0]]:.9g}"
         raise InputError(
             f"{path}: {where}: got {got}, expected a positive one of at most {LARGEST_COUNT:.0e} "

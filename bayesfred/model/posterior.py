@@ -15,6 +15,7 @@ import numpy.typing as npt
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
@@ -33,7 +34,9 @@ class Posterior(TargetDensity):
     Parameters
     ----------
     model : ForwardModel
-    counts : array_like, shape (ny, nx), counts
+    counts : array_like, MaskedArray, Quantity, NDData or CCDData, shape (ny, nx), counts
+        Masked pixels are not used. A unit has to be electrons, photons or counts; uncertainties
+        have to be those of the noise model.
     prior : mapping of str to frozen scipy.stats distribution, optional
         By parameter name; the others get the default of the table of parameters. Parameters are
         independent a priori. A distortion that leaves a source without an image, or folds the frame
@@ -55,9 +58,9 @@ class Posterior(TargetDensity):
     Raises
     ------
     InputError
-        If the frame does not fit the detector, holds values that no noise model explains, every
-        pixel is masked, no source lies in the frame, or a prior is unusable; if the extrapolation
-        is of another model.
+        If the frame does not fit the detector, is in another unit or has other uncertainties, holds
+        values that no noise model explains, every pixel is masked, no source lies in the frame, or
+        a prior is unusable; if the extrapolation is of another model.
 
     Examples
     --------
@@ -89,7 +92,7 @@ class Posterior(TargetDensity):
         nuisances: Nuisances = Nuisances(),
         extrapolation: FluxExtrapolation | None = None,
     ) -> None:
-        frame = np.array(counts, dtype=np.float64)
+        frame, mask = frame_given(counts, mask, getattr(noise, "variance", None))
         used = usable_pixels(model, frame, mask, noise, nuisances)
         if extrapolation is not None and extrapolation.model is not model:
             raise InputError(

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.posterior import Posterior
 
 SIGNIFICANCE = 4.0  # of a peak, in standard deviations of the filtered frame
@@ -49,6 +49,34 @@ def find_peaks(posterior: Posterior) -> Floats:
     # from a block's index to the frame's middle, in fine pixels
     positions = block * (vertex(filtered, j, i)[order] + 0.5) - 0.5 * np.array(detector.shape)
     return np.asarray(positions[:, ::-1] * step)
+
+
+def typical_flux(counts: Floats, mask: Flags, width: float, number: int) -> float:
+    """The mean flux of the brightest peaks as wide as the PSF, on any smooth background.
+
+    A Gaussian image of flux F and width s has the height F / 4 pi s^4 in the frame filtered with
+    minus the Laplacian of such a one.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (ny, nx), counts
+    mask : ndarray of bool, shape (ny, nx)
+        The pixels to use.
+    width : float, recorded pixel
+        The PSF's, pixels included.
+    number : int
+        How many peaks: as many as there are sources.
+
+    Returns
+    -------
+    float, counts
+        At least 1.
+    """
+    filled = np.where(mask, counts, np.median(counts[mask]))
+    filtered = -ndimage.gaussian_laplace(filled, width)
+    peak = filtered == ndimage.maximum_filter(filtered, 2 * int(np.ceil(width)) + 1)
+    heights = np.sort(filtered[peak & mask])[-number:]
+    return max(4.0 * np.pi * width**4 * float(np.mean(heights)), 1.0) if heights.size else 1.0
 
 
 def vertex(image: Floats, row: Ints, column: Ints) -> Floats:
