@@ -180,6 +180,30 @@ def test_log_prob_is_the_sum_over_all_pixels(case: str) -> None:
         assert value == pytest.approx(float(terms.sum()), rel=1e-9)
 
 
+@pytest.mark.parametrize("r", [0.05, 0.5, 1.0, 30.0])
+def test_bright_dark_and_masked_pixels_are_summed_alike(r: float) -> None:
+    # few enough counts for the table of one read noise, more than it serves, and far below zero
+    model, rng, noise = touching(), np.random.default_rng(710), PoissonNoise(r)
+    truth = make_truth(model, rng, 3.0)
+    theta, mean = [truth[name] for name in model.distortion.names], model.expected_counts
+    image = mean(np.array(theta), 3.0)
+    counts = noise.draw(image - 3.0, 3.0, rng)
+    counts[5, ::7], counts[20:22, 3:40], counts[30, 8] = 5e3 * r * r, 1e6, -60.0 * r
+    mask = rng.random(SHAPE) < 0.9
+    params = np.array([*theta, 3.0])
+    value, expected = [], []
+    for level in (3.0, 3.3, 9.0):
+        params[-1] = level
+        posterior = Posterior(model, counts, noise=noise, mask=mask)
+        value.append(posterior.log_prob(params) - posterior.log_prior(params)[0])
+        terms = noise.log_likelihood(counts, image - 3.0 + level, 0.0)[mask]
+        expected.append(math.fsum(terms))
+    assert value == pytest.approx(expected, rel=1e-9)
+    # what a step in the level changes is not lost in the sums' constant part
+    ours, theirs = np.diff(value), np.diff(expected)
+    assert ours == pytest.approx(theirs, rel=1e-8 if r < 1.0 else 1e-6)
+
+
 @pytest.mark.parametrize("case", FRAMES)
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     posterior, truth = frame(case)

@@ -13,10 +13,10 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import SEGMENT
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
+from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
 from bayesfred.model.kernels.contexts import LIMIT, Unreached, Workspace
-from bayesfred.model.kernels.noise_dispatch import at_level, derivatives, log_density, unreached
+from bayesfred.model.kernels.noise_dispatch import at_level, derivatives, summed, unreached
 
 LEAST = 1e-200  # weight of a pixel that tells anything
 U = np.uint64  # an index that has no sign need not be compared with zero
@@ -204,18 +204,6 @@ def _slope_run(part, out):
         out[i] = part.image[i] + x * (part.c1 + x * part.c2)
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
-def _density_run(noise, values, image, level, first):
-    """Sum of the log-densities of the unmasked pixels of a stretch."""
-    total = 0.0
-    for i in range(image.size):
-        mu = image[i] + level
-        counted = values[i] > LIMIT
-        term = log_density(noise, values[i] if counted else mu, mu, U(first + i))
-        total += term if counted else 0.0
-    return total
-
-
 @inner()
 def unreached_pixels(frame, w):
     """The pixels that no source reaches."""
@@ -247,7 +235,7 @@ def log_likelihood(frame, w, background):
                 part = stretch(frame, background, j, a, image)
                 level, image = part.c0, w.score[a:b]
                 _slope_run(part, image)
-            total += _density_run(noise, frame.values[a:b], image, level, a)
+            total += summed(noise, frame.values[a:b], image, level, a)
             start, stop = next_run(w, j, stop)
     rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
     return -math.inf if total + rest < LIMIT else total + rest

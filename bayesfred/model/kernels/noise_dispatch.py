@@ -10,8 +10,13 @@ place in the frame's padded, flattened rows. A model has
     information(noise, mu, p)         the expectation of W
 
 These see a pixel outside the likelihood, too, as one with n = mu; what they return for it is not
-used. They must not branch where a loop shall vectorise. Where the background is constant, a model
-may spare the loops the pixels that no source reaches:
+used. They must not branch where a loop shall vectorise. A model may have its own way to sum over
+whole segments of a row, the mean being image + level:
+
+    summed(noise, values, image, level, first)
+                                      the sum of log_density; the first pixel's place is `first`
+
+Where the background is constant, it may spare the loops the pixels that no source reaches:
 
     unreached(noise, rest, level)     the sum of log_density over them, its derivative in the level,
                                       and the sum of information; `rest` is an `Unreached`
@@ -27,7 +32,12 @@ A model that depends on the constant background beyond the mean has
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.psf_dispatch import by_type
+from bayesfred.model.kernels.contexts import LIMIT
 
 
 def _optional(name: str, default: Callable[..., Any]) -> Callable[..., Any]:
@@ -50,5 +60,24 @@ log_density = by_type(lambda family: family.log_density)
 derivatives = by_type(lambda family: family.derivatives)
 information = by_type(lambda family: family.information)
 unreached = _optional("unreached", _no_pixels)
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def sum_pixels(noise, values, image, level, first):
+    """Sum of the log-densities of the unmasked pixels of a stretch, one by one."""
+    total = 0.0
+    for i in range(image.size):
+        mu = image[i] + level
+        counted = values[i] > LIMIT
+        term = log_density(noise, values[i] if counted else mu, mu, np.uint64(first + i))
+        total += term if counted else 0.0
+    return total
+
+
+def _pixel_by_pixel(noise, values, image, level, first):
+    return sum_pixels(noise, values, image, level, first)
+
+
+summed = _optional("summed", _pixel_by_pixel)
 at_level = _optional("at_level", _same)
 level_derivatives = _optional("level_derivatives", _no_derivatives)

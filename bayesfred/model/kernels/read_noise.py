@@ -20,8 +20,14 @@ from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
-from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
-from bayesfred.model.kernels.poisson_gaussian import density_of, derivatives_of, kind_of
+from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density, sum_pixels
+from bayesfred.model.kernels.poisson_gaussian import (
+    CumulantTable,
+    density_of,
+    derivatives_of,
+    kind_of,
+    tabulated_density,
+)
 
 VALUE_TERMS = 12
 INFORMATION_TERMS = 6
@@ -56,11 +62,17 @@ class ReadNoiseTerms(NamedTuple):
     step: Floats
     table: Floats
     level: LevelSeries
+    cumulants: CumulantTable | None  # of a frame with one read noise
 
     @staticmethod
     def log_density(noise: Any, n: Any, mu: Any, p: Any) -> Any:
         """log p less what depends on n alone."""
         return density_of(noise.kind, n, mu, _at(noise.variance, p)) if mu >= 0.0 else MASKED
+
+    @staticmethod
+    def summed(noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
+        """Sum of log_density over segments."""
+        return _sum_up(noise.cumulants, noise, values, image, level, first)
 
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, p: Any) -> Any:
@@ -87,6 +99,50 @@ def _choose_at(values: Any, p: Any) -> Any:
     if isinstance(values, types.Array):
         return lambda values, p: values[p]
     return lambda values, p: values
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def _sum_tabulated(noise, values, image, level):
+    table, inverse, total = noise.cumulants, 1.0 / noise.variance, 0.0
+    for i in range(image.size):
+        mu = image[i] + level
+        counted = values[i] > LIMIT
+        term = tabulated_density(table, values[i] if counted else mu, mu, inverse)
+        term = term if mu >= 0.0 else MASKED
+        total += term if counted else 0.0
+    return total
+
+
+@inner()
+def _sum_segments(noise, values, image, level, first):
+    left_out, total, k = noise.cumulants.left_out, 0.0, 0
+    last = image.size // SEGMENT
+    while k < last:
+        begin, served = k, left_out[first // SEGMENT + k] > LIMIT
+        while k < last and (left_out[first // SEGMENT + k] > LIMIT) == served:
+            total += left_out[first // SEGMENT + k] if served else 0.0
+            k += 1
+        a, b = begin * SEGMENT, k * SEGMENT
+        if served:
+            total += _sum_tabulated(noise, values[a:b], image[a:b], level)
+        else:
+            total += sum_pixels(noise, values[a:b], image[a:b], level, first + a)
+    return total
+
+
+def _sum_up(table: Any, noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
+    raise NotImplementedError("for compiled code")
+
+
+@overload(_sum_up, inline="always", strict=False)
+def _choose_sum(table: Any, noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
+    if isinstance(table, types.NoneType):
+        return lambda table, noise, values, image, level, first: sum_pixels(
+            noise, values, image, level, first
+        )
+    return lambda table, noise, values, image, level, first: _sum_segments(
+        noise, values, image, level, first
+    )
 
 
 @inner()
@@ -247,11 +303,19 @@ def most_likely(noise, n, out):
         out[i] = mu if n[i] > 0.5 else 0.0
 
 
+def _typical_level(counts: Floats, variance: float) -> float:
+    """About the level of the sky: the mean of the counts within 3 sd of it."""
+    level = float(np.median(counts)) if counts.size else 1.0
+    for _ in range(20):
+        level = max(level, 1e-3)
+        near = counts[np.abs(counts - level) <= 3.0 * math.sqrt(level + variance)]
+        level = float(np.mean(near)) if near.size else level
+    return max(level, 1e-3)
+
+
 def level_series(noise: ReadNoiseTerms, values: Floats) -> LevelSeries:
     """The series of a frame of padded rows."""
-    used = values > LIMIT
-    typical = float(np.median(values[used])) if used.any() else 1.0
-    middle = math.log(max(typical, 1e-3))
+    middle = math.log(_typical_level(values[values > LIMIT], float(np.median(noise.variance))))
     flat, parts = values.ravel(), []
     for terms, informed in ((VALUE_TERMS, False), (INFORMATION_TERMS, True)):
         angle = np.pi * (np.arange(terms) + 0.5) / terms
@@ -271,4 +335,4 @@ def new_terms(
     """The compiled half for pixels in the order in which they are given, without a frame."""
     none = np.empty((0, 0))
     level = LevelSeries(0.0, none, none.ravel(), none.ravel())
-    return ReadNoiseTerms(kind_of(variance), variance, row, *rows, level)
+    return ReadNoiseTerms(kind_of(variance), variance, row, *rows, level, None)

@@ -20,7 +20,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from bayesfred._typing import Floats
-from bayesfred.model.kernels.poisson_gaussian import left_out
+from bayesfred.imaging.kernels.contexts import SEGMENT
+from bayesfred.model.kernels.poisson_gaussian import cumulant_table, left_out
 from bayesfred.model.kernels.read_noise import (
     CELLS,
     InformationRows,
@@ -167,8 +168,10 @@ def _moments(means: Floats, r: float) -> Floats:
 def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     """The compiled half for a frame of padded rows."""
     terms = _terms(read_noise)
-    series = level_series(terms, values)
-    return ReadNoiseTerms(*terms[:-1], series)
+    cumulants = None
+    if isinstance(read_noise, float):
+        cumulants = cumulant_table(read_noise**2, values, SEGMENT)
+    return terms._replace(level=level_series(terms, values), cumulants=cumulants)
 
 
 def _terms(read_noise: float | Floats) -> ReadNoiseTerms:
