@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numba as nb
 import numpy as np
 import oracles
 import pytest
@@ -30,6 +31,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector, correct_sampling
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.kernels.psf_dispatch import psf_second_derivatives, psf_slopes
 from bayesfred.imaging.logarithm import LogDistortion
 from bayesfred.imaging.psf import FWHM, PSF, GaussianPSF, MoffatPSF, SampledPSF
 from bayesfred.model.noise import simulate
@@ -294,6 +296,9 @@ CASES = {
 }
 
 
+LONG = pytest.mark.long  # what costs most to compile
+
+
 def make_posterior(
     psf: PSF, nuisances: Nuisances, detector: Detector, seed: int
 ) -> tuple[Posterior, Floats]:
@@ -308,7 +313,7 @@ def make_posterior(
     return posterior, truth
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ["scale", pytest.param("free, scattered, box", marks=LONG)])
 def test_gradient_is_that_of_log_prob(psf: PSF, case: str) -> None:
     posterior, truth = make_posterior(psf, *CASES[case], 85)
     scale = errors(posterior, truth)
@@ -319,6 +324,26 @@ def test_gradient_is_that_of_log_prob(psf: PSF, case: str) -> None:
     assert posterior.gradient(params) * scale == pytest.approx(
         np.array(numerical) * scale, rel=1e-6, abs=1e-6
     )
+
+
+@nb.njit
+def slopes_and_their_derivatives(profile: Any, a: float, b: float) -> Any:
+    return psf_slopes(profile, a, b), psf_second_derivatives(profile, a, b)
+
+
+def test_second_derivatives_are_those_of_slopes(psf: PSF) -> None:
+    """A family's methods return p, -p_a, -p_b, and then -p_a, -p_b, p_aa, p_ab, p_bb."""
+    rng, step = np.random.default_rng(89), 1e-4
+    for at in rng.uniform(-2.0, 2.0, (20, 2)):
+        slopes, found = slopes_and_their_derivatives(psf.profile, *at)
+
+        def of(point: Floats) -> Floats:
+            return np.array(slopes_and_their_derivatives(psf.profile, *point)[0])
+
+        p_a, p_b = (five_point(of, at, k, step) for k in range(2))
+        assert slopes[1:] == pytest.approx([-p_a[0], -p_b[0]], abs=1e-9)
+        assert found == pytest.approx([*slopes[1:], -p_a[1], -p_a[2], -p_b[2]], abs=1e-9)
+        assert -p_b[1] == pytest.approx(found[3], abs=1e-9)
 
 
 def test_fisher_is_that_of_the_images(psf: PSF) -> None:
@@ -350,6 +375,7 @@ def test_width_is_that_of_a_wider_psf() -> None:
         )
 
 
+@pytest.mark.statistics
 def test_refits_scatter_as_the_covariance_says(psf: PSF) -> None:
     """The mean of 20 Mahalanobis distances of 15 parameters, in its own Monte Carlo errors."""
     deviations, covariances = [], []

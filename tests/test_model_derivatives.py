@@ -121,7 +121,11 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+# what costs most to compile is among the long runs
+COSTLY = pytest.param("free, gaussian", marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("case", [COSTLY if case in COSTLY.values else case for case in CASES])
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     model, nuisances, noise, background = CASES[case]
     rng = np.random.default_rng(20)
@@ -193,7 +197,7 @@ def test_fisher_is_that_of_the_dense_jacobian(case: str) -> None:
         "free, touching",
         "free, overlapping",
         "free, few photons",
-        "free, gaussian",
+        COSTLY,
     ],
 )
 def test_fisher_with_free_fluxes_is_the_schur_complement(case: str) -> None:

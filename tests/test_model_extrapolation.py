@@ -83,7 +83,14 @@ def draws(best: MapEstimate, sd: float) -> Floats:
     return np.asarray(best.params + sd * whitened @ np.linalg.cholesky(best.covariance).T)
 
 
-@pytest.mark.parametrize("case", CASES)
+# what costs most to compile is among the long runs
+NAMES = [
+    pytest.param(name, marks=pytest.mark.long if name in {"nuisances", "Moffat"} else ())
+    for name in CASES
+]
+
+
+@pytest.mark.parametrize("case", NAMES)
 def test_near_the_maximum_log_prob_is_the_same(case: str) -> None:
     posterior, near, best = solved(case)
     for sd in (0.1, 1.0, 3.0):

@@ -83,7 +83,13 @@ def at_random(posterior: Posterior, named: dict[str, float], rng: np.random.Gene
     return np.asarray(truth + 0.5 * errors(posterior, truth) * rng.uniform(-1, 1, truth.size))
 
 
-@pytest.mark.parametrize("case", CASES)
+# what costs most to compile is among the long runs
+NAMES = [
+    pytest.param(name, marks=pytest.mark.long if name == "printed kernel" else ()) for name in CASES
+]
+
+
+@pytest.mark.parametrize("case", NAMES)
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     model, tau, background, noise = CASES[case]
     rng = np.random.default_rng(50)
@@ -216,6 +222,7 @@ def test_scatter_is_outside_the_support_below_zero_and_needs_free_fluxes() -> No
 FRAMES = 24
 
 
+@pytest.mark.statistics
 def test_errors_hold_where_positions_scatter() -> None:
     """Refits of simulated frames: 25 sources whose positions scatter by five times what photon
     noise does to them."""

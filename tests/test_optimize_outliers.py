@@ -233,6 +233,7 @@ def test_clean_frames_are_fitted_whole() -> None:
     assert "left out" not in estimate.message and "left out" not in find_map(posterior).message
 
 
+@pytest.mark.statistics
 def test_error_bars_hold_where_a_tenth_is_missing_and_a_tenth_foreign() -> None:
     """Ten frames: their mean chi-square per parameter has a Monte Carlo error of sqrt(2 / 470) =
     0.065."""

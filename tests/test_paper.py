@@ -89,7 +89,14 @@ def differences(section: Any, text: str) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("name", paper.MODULES)
+# 3175 x 3175 pixels take longest
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name == "table3" else ())
+        for name in paper.MODULES
+    ],
+)
 def test_readme_says_what_comes_out(name: str) -> None:
     assert differences(quick(name), README) == []
 
@@ -185,6 +192,10 @@ def test_reference_psf_of_a_lone_spot_is_exact() -> None:
 
 def test_reconstruction_without_noise_leaves_rounding() -> None:
     assert value(rows("figure6")["polynomial: V"]) < 1e-28
+
+
+@pytest.mark.long
+def test_reconstruction_of_binned_pixels_without_noise_leaves_rounding() -> None:
     # coordinates u, x of 1500 pixels are rounded to 1e-13, a spot's values to 1e-14 and less: 324
     # pixels make some 1e-27
     assert value(rows("table3")["polynomial: V, Fredholm"]) < 1e-25

@@ -101,7 +101,8 @@ CASES = {
 
 # what costs most to compile is among the long runs
 NAMES = [
-    pytest.param(name, marks=pytest.mark.long if name == "scattered" else ()) for name in CASES
+    pytest.param(name, marks=pytest.mark.long if CASES[name].flux == "free" else ())
+    for name in CASES
 ]
 
 
@@ -179,6 +180,7 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     )
 
 
+@pytest.mark.long
 def test_extrapolated_fluxes_are_those_that_are_searched_for() -> None:
     posterior = fitted("free")
     best = find_map(posterior)
