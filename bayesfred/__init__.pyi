@@ -22,6 +22,8 @@ from .model.parameters import Nuisances
 from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
+from .optimize.follow import follow_images
+from .optimize.uncatalogued import UncataloguedSources, find_uncatalogued
 from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
 from .sampling.laplace import laplace
@@ -59,6 +61,7 @@ __all__ = [
     "SampledPSF",
     "SourceCatalog",
     "TermChoice",
+    "UncataloguedSources",
     "choose_terms",
     "commands",
     "compare",
@@ -68,6 +71,8 @@ __all__ = [
     "displacement_field",
     "find_causes",
     "find_map",
+    "find_uncatalogued",
+    "follow_images",
     "laplace",
     "log_evidence",
     "noise_study",

@@ -6,7 +6,7 @@ Nothing is printed. What should be known while a step works goes to `say`, one l
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,9 @@ from bayesfred.errors import InputError, printable
 from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.find_map import reject_outliers
+from bayesfred.optimize.find_map import find_map, reject_outliers
+from bayesfred.optimize.follow import follow_images
+from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.records import Result, Study
 from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
@@ -131,9 +133,15 @@ def read_frame(
         model = build.forward_model(run, shape, sources, psf)
         posterior = build.posterior_given(run, model, frame.counts, frame.valid, noise)
         estimate = None
+        if posterior.nuisances.footprint is not None:
+            with searching() if say else nullcontext():
+                posterior, estimate, lines = _follow(posterior)
+            for line in lines:
+                note(line)
         if f.reject_outliers:
             with searching() if say else nullcontext():
-                kept, estimate = reject_outliers(posterior)
+                start = None if estimate is None else estimate.params
+                kept, estimate = reject_outliers(posterior, start)
             note(_census(posterior, kept))
             posterior = kept
         if run.distortion.terms == "choose":
@@ -143,6 +151,23 @@ def read_frame(
             for line in choice.lines():
                 note(line)
     return posterior, estimate, notes
+
+
+def _follow(posterior: Posterior) -> tuple[Posterior, MapEstimate, list[str]]:
+    """Footprints around the images, without the sources there that the catalogue lacks."""
+    followed = follow_images(posterior)
+    shared = int(np.sum(followed.mask & posterior.mask))
+    lines = [
+        f"footprints: {followed.mask.sum()} pixels around the images, {shared} of which are as "
+        "near to the catalogue's positions"
+    ]
+    estimate = find_map(followed)
+    found = find_uncatalogued(followed, estimate)
+    if lost := int(np.sum(followed.mask & ~found.mask)):
+        lines.append(f"{found.message}; {lost} pixels masked")
+        followed = replace(followed, mask=found.mask, extrapolation=None)
+        estimate = find_map(followed)
+    return followed, estimate, lines
 
 
 def _census(posterior: Posterior, kept: Posterior) -> str:

@@ -45,7 +45,8 @@ class Nuisances:
         `background_uv`, `background_v2`, counts per pixel.
     footprint : float or None, pixel
         Only pixels within this distance of a catalogue position enter the likelihood; for frames
-        with sources that the catalogue lacks.
+        with sources that the catalogue lacks. `follow_images` puts the images in the place of the
+        catalogue's positions; so do run files.
     position_scatter : bool
         Whether the sources lie off their catalogue positions, by normal errors of unknown standard
         deviation along each axis: parameter `position_scatter`, pixel, as imaged. Needs free

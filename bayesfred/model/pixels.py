@@ -5,6 +5,7 @@ import numpy.typing as npt
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
+from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.noise import Noise
 from bayesfred.model.parameters import Nuisances
@@ -50,7 +51,8 @@ def usable_pixels(
             "and their origin"
         )
     if nuisances.footprint is not None:
-        used &= _footprint(model, nuisances.footprint)
+        positions = np.stack([sources.x, sources.y], axis=1)
+        used &= footprints(model.detector, positions, nuisances.footprint)
     if not used.any():
         raise InputError(
             "counts: every pixel is masked, expected pixels to fit: check the mask and the "
@@ -65,11 +67,23 @@ def usable_pixels(
     return used
 
 
-def _footprint(model: ForwardModel, radius: float) -> Flags:
-    """Pixels within `radius` of a source's catalogue position."""
-    u, v = model.detector.pixel_centres()
+def footprints(detector: Detector, positions: Floats, radius: float) -> Flags:
+    """Pixels within `radius` of a position.
+
+    Parameters
+    ----------
+    detector : Detector
+    positions : ndarray, shape (n, 2), fine pixel
+        From the middle of the frame; nan where there is none.
+    radius : float, fine pixel
+
+    Returns
+    -------
+    ndarray of bool, shape (ny, nx)
+    """
+    u, v = detector.pixel_centres()
     inside = np.zeros((v.size, u.size), bool)
-    for x, y in zip(model.sources.x, model.sources.y, strict=True):
+    for x, y in positions:
         across, along = np.abs(u - x) <= radius, np.abs(v - y) <= radius
         near = (u[across] - x) ** 2 + (v[along, None] - y) ** 2 <= radius**2
         inside[np.ix_(along, across)] |= near

@@ -48,6 +48,8 @@ class Posterior(TargetDensity):
     nuisances : Nuisances
     extrapolation : FluxExtrapolation, optional
         Where free fluxes have their maximum near some parameters: `near` makes it.
+    valid : array_like of bool, shape (ny, nx), optional
+        True where a pixel may be used when the footprint moves; by default `mask`.
 
     Attributes
     ----------
@@ -80,6 +82,7 @@ class Posterior(TargetDensity):
     mask: Flags
     nuisances: Nuisances
     extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
+    valid: Flags = field(metadata={"stored": False})
 
     def __init__(
         self,
@@ -91,16 +94,19 @@ class Posterior(TargetDensity):
         mask: npt.ArrayLike | None = None,
         nuisances: Nuisances = Nuisances(),
         extrapolation: FluxExtrapolation | None = None,
+        valid: npt.ArrayLike | None = None,
     ) -> None:
         frame, mask = frame_given(counts, mask, getattr(noise, "variance", None))
         used = usable_pixels(model, frame, mask, noise, nuisances)
+        if valid is None:
+            valid = np.isfinite(frame) & (True if mask is None else mask)
         if extrapolation is not None and extrapolation.model is not model:
             raise InputError(
                 "extrapolation: got that of another model, expected this one's: leave it out"
             )
         values: tuple[Any, ...] = (
             model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
-            extrapolation,
+            extrapolation, np.array(valid, dtype=bool),
         )  # fmt: skip
         for name, value in zip((f.name for f in fields(self)), values, strict=True):
             object.__setattr__(self, name, value)

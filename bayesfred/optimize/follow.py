@@ -1,0 +1,90 @@
+"""Footprints around the images of the sources, wherever the distortion puts them.
+
+A `footprint` keeps the likelihood to pixels near the sources, because the frame shows others that
+the catalogue lacks. The catalogue's positions are where it begins. Where images stand off these by
+more than a part of the radius, the footprints lose their light and gain that of others. So they are
+put around the images, the posterior is maximised, and so on until no pixel changes.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from bayesfred._typing import Flags, Floats
+from bayesfred.model.pixels import footprints
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.newton import maximize
+from bayesfred.optimize.starts import find_start
+
+ROUNDS = 10
+STEPS = 8  # of Newton's method between two moves of the footprints
+
+
+def follow_images(posterior: Posterior, estimate: MapEstimate | None = None) -> Posterior:
+    """Put the footprints around the images of the sources in place of the catalogue's positions.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With a `footprint` among its nuisances; any other is returned as it is.
+    estimate : MapEstimate, optional
+        Where the images are to begin with. By default peaks of the whole frame are matched to the
+        catalogue, as `find_map` does.
+
+    Returns
+    -------
+    Posterior
+        Its mask has the pixels within the radius of an image at the maximum of its own density; its
+        `nuisances.footprint` is None, as the footprints are in the mask.
+
+    Raises
+    ------
+    InputError
+        If no image lies on a valid pixel.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> sources = bf.SourceCatalog([-10.0, 20.0], [0.0, 5.0], [1e4, 1e4])
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65)), sources, bf.GaussianPSF(2.0),
+    ...     bf.PolynomialDistortion(f_terms=[(1, 0, 0, 0)], g_terms=[]))
+    >>> posterior = bf.Posterior(
+    ...     model, bf.simulate(model, [0.2], 2.0, seed=1), nuisances=bf.Nuisances(footprint=5.0))
+    >>> followed = bf.follow_images(posterior)  # the source at x = 20 is imaged at 20 / 1.2
+    >>> u = np.flatnonzero(followed.mask[37]) - 32
+    >>> int(u.min()), int(u.max())
+    (12, 21)
+    """
+    radius = posterior.nuisances.footprint
+    if radius is None:
+        return posterior
+    params = estimate.params if estimate is not None else _start(posterior)
+    seen: set[bytes] = set()
+    for _ in range(ROUNDS):
+        followed = _around(posterior, params, radius)
+        key = followed.mask.tobytes()
+        if key in seen or not np.isfinite(followed.log_prob(params)):
+            break
+        seen.add(key)
+        params = maximize(followed, params, steps=STEPS).params
+    return followed
+
+
+def _start(posterior: Posterior) -> Floats:
+    """Where peaks of the whole frame, or those near the catalogue's positions, match better."""
+    near = find_start(posterior)
+    anywhere = find_start(_within(posterior, posterior.valid))
+    return near.params if near.matched > anywhere.matched else anywhere.params
+
+
+def _around(posterior: Posterior, params: Floats, radius: float) -> Posterior:
+    images = posterior.likelihood.image_positions(params)
+    near = footprints(posterior.model.detector, images, radius)
+    return _within(posterior, posterior.valid & near)
+
+
+def _within(posterior: Posterior, pixels: Flags) -> Posterior:
+    nuisances = replace(posterior.nuisances, footprint=None)
+    return replace(posterior, mask=pixels, nuisances=nuisances, extrapolation=None)

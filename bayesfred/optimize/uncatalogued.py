@@ -1,0 +1,209 @@
+"""Sources in the frame that the catalogue lacks.
+
+What is left of a frame without its catalogued sources and the background is filtered with minus the
+Laplacian of a Gaussian of width s, which passes what is as narrow as a source. An image of flux F
+and width w has the height F / pi (s^2 + w^2)^2 there; the variance of a pixel V becomes the sum of
+V k^2 around it, k being the filter. Peaks above 5 standard deviations are light that no source
+explains.
+
+A PSF that is not quite right leaves such peaks around bright stars. But they are about the same
+share of the light at the same distance from every star, whereas a source that the catalogue lacks
+stands near one star. So near stars a peak has to exceed, too, 2.5 times the share that is common:
+the 75 % quantile of the bright stars'.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage, signal, spatial
+
+from bayesfred._typing import Flags, Floats
+from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.outliers import FAINT, SIGNIFICANCE
+from bayesfred.optimize.peaks import vertex
+
+COMMON = 0.75  # quantile of the bright stars' shares that is the PSF's
+MISFIT = 2.5  # times that
+STARS = 40  # of which it is measured, the brightest third and at least 5
+FARTHEST = 8.0  # filter widths from a star to which the PSF's misfit is followed
+RINGS = 2  # a filter width
+LOOKS = 5  # for peaks, those that others hid among them
+NAMED = 10  # sources in the message
+
+
+@dataclass(frozen=True, eq=False)
+class UncataloguedSources:
+    """Light in a frame that no catalogued source explains.
+
+    Attributes
+    ----------
+    u, v : ndarray, shape (n,), pixel
+        Where it is, from the middle of the frame; the brightest first.
+    photons, sd : ndarray, shape (n,), counts
+        Its flux, for an image like the PSF, and the standard deviation from the noise.
+    mask : ndarray of bool, shape (ny, nx)
+        The posterior's pixels but for those that this light reaches.
+    message : str
+        One line: how many there are, and the brightest ones' positions and photons.
+    """
+
+    u: Floats
+    v: Floats
+    photons: Floats
+    sd: Floats
+    mask: Flags
+    message: str
+
+
+def find_uncatalogued(posterior: Posterior, estimate: MapEstimate) -> UncataloguedSources:
+    """Find the sources that the catalogue lacks whose light reaches the pixels in use.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    estimate : MapEstimate
+        Where the catalogued sources are imaged.
+
+    Returns
+    -------
+    UncataloguedSources
+        `dataclasses.replace(posterior, mask=found.mask)` is the posterior without them.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(2.0),
+    ...     bf.PolynomialDistortion(f_terms=[(1, 0, 1, 0)], g_terms=[]))
+    >>> other = bf.ForwardModel(
+    ...     model.detector, bf.SourceCatalog([7.0], [6.0], [2e3]), model.psf, model.distortion)
+    >>> counts = bf.simulate(model, [1e-4], 2.0, seed=1) + other.expected_counts([0.0])
+    >>> posterior = bf.Posterior(model, counts.round())
+    >>> bf.find_uncatalogued(posterior, bf.find_map(posterior)).message
+    '1 source that the catalogue lacks: (7.0, 6.0) 1975 photons'
+    """
+    frame = _Filtered(posterior, estimate.params)
+    found = np.zeros((0, 3))  # row, column, photons
+    for _ in range(LOOKS):
+        new = frame.peaks(found)
+        if not len(new):
+            break
+        found = np.concatenate([found, new])
+    light = frame.light(found)
+    spread = ndimage.maximum_filter(light, 2 * int(np.ceil(0.25 * frame.width)) + 1)
+    covered = spread > FAINT * np.sqrt(frame.variance)
+    # of those that reach the pixels in use
+    labels, _ = ndimage.label(covered)
+    at = tuple(np.clip(np.rint(found[:, :2]).astype(int), 0, np.array(light.shape) - 1).T)
+    sd = frame.area * frame.noise(frame.variance + light)[at]
+    reaching = np.flatnonzero(np.isin(labels[at], labels[posterior.mask & covered]))
+    order = reaching[np.argsort(-found[reaching, 2], kind="stable")]
+    found, sd = found[order], sd[order]
+    detector = posterior.model.detector
+    v, u = (found[:, :2] - 0.5 * (np.array(detector.shape) - 1.0)).T * detector.binning
+    kept, message = posterior.mask & ~covered, _message(u, v, found[:, 2])
+    return UncataloguedSources(u, v, found[:, 2], sd, kept, message)
+
+
+def _message(u: Floats, v: Floats, photons: Floats) -> str:
+    n = len(u)
+    if not n:
+        return "no source that the catalogue lacks"
+    named = zip(u[:NAMED], v[:NAMED], photons[:NAMED], strict=True)
+    places = ", ".join(f"({a:.1f}, {b:.1f}) {flux:.0f} photons" for a, b, flux in named)
+    more = f" and {n - NAMED} fainter ones" if n > NAMED else ""
+    return f"{n} source{'s' * (n > 1)} that the catalogue lacks: {places}{more}"
+
+
+class _Filtered:
+    """A frame without what its model explains, filtered."""
+
+    def __init__(self, posterior: Posterior, params: Floats) -> None:
+        model, step = posterior.model, posterior.model.detector.binning
+        known = dict(zip(posterior.parameter_names, params, strict=True))
+        self.posterior = posterior
+        integrated = 12.0**-0.5 if model.detector.pixel == "box" or step > 1 else 0.0
+        image = np.hypot(known.get("psf_sigma", model.psf.sigma) / step, integrated)
+        self.width = max(float(image), 1.0)  # in narrower filters pixels show
+        self.area = np.pi * (self.width**2 + image**2) ** 2  # of flux over height
+        expected = posterior.expected_counts(params)
+        self.residual = posterior.counts - expected
+        self.variance = posterior.noise.counts_variance(expected, known["background"])
+        ny, nx = model.detector.shape
+        images = posterior.likelihood.image_positions(params)[:, ::-1] / step
+        images = images + 0.5 * (np.array([ny, nx]) - 1.0)  # row, column
+        self.flux = posterior.fluxes(params)
+        seen = np.isfinite(images).all(axis=1) & np.isfinite(self.flux)
+        self.images, self.flux = images[seen], self.flux[seen]
+        reach = 2 * int(np.ceil(4.0 * self.width)) + 1
+        delta = np.zeros((reach, reach))
+        delta[reach // 2, reach // 2] = 1.0
+        self.square = ndimage.gaussian_laplace(delta, self.width) ** 2
+        self.sd = self.noise(self.variance)
+        self.misfit = self._misfit(self._excess(np.zeros((0, 3))))
+
+    def noise(self, variance: Floats) -> Floats:
+        """Standard deviation of the filtered frame, for a variance of every pixel."""
+        valid = np.where(self.posterior.valid, variance, 0.0)
+        total = signal.fftconvolve(valid, self.square, mode="same")
+        return np.asarray(np.sqrt(np.maximum(total, 1e-12 * total.max())))
+
+    def _excess(self, found: Floats) -> Floats:
+        left = np.where(self.posterior.valid, self.residual - self.light(found), 0.0)
+        return np.asarray(-ndimage.gaussian_laplace(left, self.width))
+
+    def light(self, found: Floats) -> Floats:
+        """The image of what was found, shape (ny, nx)."""
+        model = self.posterior.model
+        if not len(found):
+            return np.zeros(model.detector.shape)
+        at = (found[:, :2] - 0.5 * (np.array(model.detector.shape) - 1.0)) * model.detector.binning
+        sources = SourceCatalog(at[:, 1], at[:, 0], found[:, 2])
+        theta = np.zeros(model.distortion.n_terms)
+        return replace(model, sources=sources).expected_counts(theta)
+
+    def _misfit(self, excess: Floats) -> Floats:
+        """Share of a star's light that the PSF's misfit leaves, by distance from the star."""
+        rings = int(FARTHEST * RINGS)
+        inside = np.all((self.images > 0) & (self.images < np.array(excess.shape) - 1), axis=1)
+        order = np.flatnonzero(inside)[np.argsort(-self.flux[inside])]
+        stars = order[: min(max(len(order) // 3, 5), STARS)]
+        share = np.zeros((len(stars), rings))
+        more = np.maximum(np.abs(excess) - 3.0 * self.sd, 0.0)  # than noise
+        reach = int(np.ceil(FARTHEST * self.width))
+        for k, (row, column) in enumerate(self.images[stars]):
+            j, i = round(row), round(column)
+            top, left = max(0, j - reach), max(0, i - reach)
+            window = more[top : j + reach + 1, left : i + reach + 1]
+            y, x = np.indices(window.shape)
+            ring = RINGS * np.hypot(y + top - row, x + left - column) / self.width
+            near = ring < rings
+            np.maximum.at(share[k], ring[near].astype(int), window[near])
+            share[k] /= max(self.flux[stars[k]], 1.0)
+        return MISFIT * np.quantile(share, COMMON, axis=0) if len(stars) else np.zeros(rings)
+
+    def peaks(self, found: Floats) -> Floats:
+        """Peaks that neither stars nor what was found explain: row, column, photons."""
+        excess, size = self._excess(found), 2 * int(np.ceil(2.0 * self.width)) + 1
+        limit = SIGNIFICANCE * self.sd + SIGNIFICANCE**2 / self.area
+        peak = np.zeros(excess.shape, bool)
+        inner = slice(int(np.ceil(self.width)), -int(np.ceil(self.width)))  # the edge is mirrored
+        peak[inner, inner] = (self.posterior.valid & (excess > limit))[inner, inner]
+        row, column = np.nonzero(peak & (excess == ndimage.maximum_filter(excess, size)))
+        places = np.stack([row, column], axis=1).astype(np.float64)
+        above = excess[row, column] - limit[row, column]
+        lights = np.concatenate([self.images, found[:, :2]])
+        if len(lights) and len(row):
+            fluxes = np.concatenate([self.flux, found[:, 2]])
+            near = spatial.cKDTree(lights).query_ball_point(places, FARTHEST * self.width)
+            for k, some in enumerate(near):
+                distance = np.hypot(*(lights[some] - places[k]).T) / self.width
+                ring = np.minimum((RINGS * distance).astype(int), len(self.misfit) - 1)
+                above[k] -= np.sum(fluxes[some] * self.misfit[ring])
+        row, column = row[above > 0.0], column[above > 0.0]
+        positions, t = vertex(excess, row, column), np.sqrt(self.area / np.pi)
+        off = ((positions - np.column_stack([row, column])) ** 2).sum(axis=1) / (2.0 * t)
+        height = excess[row, column] / ((1.0 - off) * np.exp(-off))  # between pixels
+        return np.column_stack([positions, self.area * height])

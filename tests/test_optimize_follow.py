@@ -1,0 +1,158 @@
+"""Footprints follow the images; light of sources that the catalogue lacks is masked and named."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import planted
+import pytest
+from astropy.io import fits
+from numpy.typing import NDArray
+from test_pipeline_frames import GAIN, RUN, write
+
+import bayesfred as bf
+from bayesfred import pipeline
+from bayesfred.settings import read_settings
+
+Floats = NDArray[np.float64]
+
+RADIUS = 6.0
+LINEAR = bf.PolynomialDistortion([(1, 0, 0, 0), (3, 0, 0, 0)], [(0, 1, 0, 0), (0, 3, 0, 0)])
+SCALE = np.array([0.1, 1e-6, 0.1, 1e-6])  # moves sources by up to 7 pixels
+
+
+def displaced(seed: int) -> tuple[bf.Posterior, Floats]:
+    """A frame whose stars stand up to more than a footprint off their places, among 30 others."""
+    rng = np.random.default_rng(seed)
+    sources = planted.field(seed)
+    model = planted.camera(sources, distortion=LINEAR)
+    theta = SCALE * np.array([1.0, rng.normal(), 1.0, rng.normal()])
+    places = rng.uniform(-75.0, 75.0, (2, 200))
+    alone = np.hypot(*(places[:, :, None] - np.array([sources.x, sources.y])[:, None])).min(1) > 6.0
+    others = bf.SourceCatalog(*places[:, alone][:, :30], rng.uniform(400.0, 1600.0, 30))
+    light = replace(model, sources=others).expected_counts(theta)
+    counts = np.random.default_rng(seed).poisson(model.expected_counts(theta, 20.0) + light)
+    return bf.Posterior(model, counts, nuisances=bf.Nuisances(footprint=RADIUS)), theta
+
+
+def test_footprints_are_where_the_images_are() -> None:
+    posterior, theta = displaced(1)
+    followed = bf.follow_images(posterior)
+    images = posterior.likelihood.image_positions(np.append(theta, 20.0))
+    v, u = np.indices(posterior.counts.shape) - planted.HALF
+    distance = np.hypot(u[..., None] - images[:, 0], v[..., None] - images[:, 1]).min(axis=-1)
+    assert followed.mask[distance < RADIUS - 0.2].all()
+    assert not followed.mask[distance > RADIUS + 0.2].any()
+    # negative control: the catalogue's positions are elsewhere
+    assert np.mean(posterior.mask[distance < RADIUS]) < 0.7
+    assert followed.nuisances.footprint is None and bf.follow_images(followed) is followed
+    # from an estimate, too, and whatever the frame masks stays masked
+    masked = replace(posterior, valid=distance > 1.0)
+    again = bf.follow_images(masked, bf.find_map(followed))
+    assert not again.mask[distance < 1.0].any()
+    assert again.mask[(distance > 1.0) & (distance < RADIUS - 0.3)].all()
+
+
+def test_the_coefficients_are_found_where_the_images_left_the_footprints() -> None:
+    z, before = [], []
+    for seed in range(12):
+        posterior, theta = displaced(seed)
+        followed = bf.follow_images(posterior)
+        estimate = bf.find_map(followed)
+        kept = replace(followed, mask=bf.find_uncatalogued(followed, estimate).mask)
+        estimate = bf.find_map(kept)
+        sd = np.sqrt(np.diag(estimate.covariance))[:4]
+        z.append((estimate.params[:4] - theta) / sd)
+        before.append((bf.find_map(posterior).params[:4] - theta) / sd)
+    square = np.mean(np.square(z))  # of 48 numbers, which scatters by 0.2 if they are normal
+    assert square < 1.0 + 3.0 * 0.2
+    # negative control: around the catalogue's positions the fit is lost
+    assert np.mean(np.square(before)) > 3.0
+
+
+def companions(seed: int, psf: bf.GaussianPSF | bf.MoffatPSF, share: float = 0.15) -> bf.Posterior:
+    """A frame in which 4 of 48 stars have a companion of this share of their light."""
+    rng = np.random.default_rng(seed)
+    sources = planted.field(seed)
+    model = planted.camera(sources, psf=psf)
+    few, angle = np.arange(4), rng.uniform(0.0, 2.0 * np.pi, 4)
+    distance = rng.uniform(5.0, 7.0, 4)
+    near = bf.SourceCatalog(
+        sources.x[few] + distance * np.cos(angle),
+        sources.y[few] + distance * np.sin(angle),
+        share * sources.flux[few] + 1e-9,
+    )
+    light = replace(model, sources=near).expected_counts(planted.THETA)
+    counts = rng.poisson(model.expected_counts(planted.THETA, planted.LEVEL) + light)
+    nuisances = bf.Nuisances("free", offset=True, psf_sigma=True, footprint=9.0)
+    return bf.Posterior(replace(model, psf=bf.GaussianPSF(1.8)), counts, nuisances=nuisances)
+
+
+def looked(posterior: bf.Posterior) -> bf.UncataloguedSources:
+    followed = bf.follow_images(posterior)
+    return bf.find_uncatalogued(followed, bf.find_map(followed))
+
+
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(40), marks=pytest.mark.statistics)])
+def test_companions_are_found_and_nothing_else(seeds: range) -> None:
+    """Companions of 15 % at 3 to 4 widths from their stars."""
+    number = [len(looked(companions(seed, bf.GaussianPSF(1.8))).u) for seed in seeds]
+    assert 3.0 < np.mean(number) <= 4.1
+    # negative control: no companions, nothing found but by chance
+    clean = [looked(companions(seed, bf.GaussianPSF(1.8), 0.0)) for seed in seeds]
+    assert sum(len(found.u) for found in clean) <= 1
+    assert clean[0].message == "no source that the catalogue lacks"
+    assert clean[0].mask.sum() > 0
+
+
+@pytest.mark.statistics
+def test_wings_of_the_psf_are_no_companions() -> None:
+    """Moffat images fitted with a Gaussian leave a ring around every bright star."""
+    wide = bf.MoffatPSF(4.2, 3.0)
+    found = [looked(companions(seed, wide, 0.0)) for seed in range(20)]
+    assert sum(len(each.u) for each in found) <= 10  # half a star of 48 a frame
+    # what exceeds the wings is found
+    more = [looked(companions(seed, wide, 0.5)) for seed in range(20)]
+    assert np.mean([len(each.u) for each in more]) > 2.5
+
+
+def test_positions_and_photons_have_their_errors() -> None:
+    model = planted.camera(planted.field(3))
+    rng, z, off = np.random.default_rng(3), [], []
+    at, flux = (30.3, -71.6), 3000.0
+    light = replace(model, sources=bf.SourceCatalog(*np.array([at]).T, [flux]))
+    mean = model.expected_counts(planted.THETA, 20.0) + light.expected_counts(0 * planted.THETA)
+    for _ in range(100):
+        posterior = bf.Posterior(model, rng.poisson(mean))
+        params = np.append(planted.THETA, 20.0)
+        found = bf.find_uncatalogued(posterior, estimate_at(params))
+        k = np.argmin(np.hypot(found.u - at[0], found.v - at[1]))
+        z.append((found.photons[k] - flux) / found.sd[k])
+        off.append([found.u[k] - at[0], found.v[k] - at[1]])
+    assert 0.75 < np.std(z) < 1.25  # +- 0.07; it is the highest of nearby pixels, too
+    assert abs(np.mean(z)) < 0.4  # +- 0.1
+    assert np.all(np.abs(np.mean(off, axis=0)) < 0.1) and np.abs(off).max() < 0.5
+
+
+def estimate_at(params: Floats) -> bf.MapEstimate:
+    return bf.MapEstimate(params, np.eye(params.size), 0.0, 0, "")
+
+
+def test_a_run_prints_what_it_masks(tmp_path: Path) -> None:
+    run = write(tmp_path, '[nuisances]\nflux = "free"\nfootprint = 8.0')
+    frame = tmp_path / "frame.fits"
+    with fits.open(frame) as hdus:
+        stored, header = np.array(hdus[0].data), hdus[0].header
+    v, u = np.indices(stored.shape) - 59.5
+    stored += 2000.0 / (8.0 * np.pi * GAIN) * np.exp(-((u - 6.0) ** 2 + (v - 4.0) ** 2) / 8.0)
+    fits.PrimaryHDU(stored, header).writeto(frame, overwrite=True)
+    posterior, estimate, notes = pipeline.read_frame(read_settings(run), run, None)
+    assert notes[2].startswith("footprints: ")
+    assert notes[3].startswith("1 source that the catalogue lacks: (5.9, 3.9) ")
+    assert notes[3].endswith(" pixels masked")
+    assert estimate is not None and estimate.fits_data
+    assert not posterior.mask[round(59.5 + 4.0), round(59.5 + 6.0)]
+    # negative control: without footprints nothing is asked, and the model does not fit
+    (tmp_path / "run.toml").write_text(RUN + '[nuisances]\nflux = "free"')
+    posterior, estimate, notes = pipeline.read_frame(read_settings(run), run, None)
+    assert estimate is None and not bf.find_map(posterior).fits_data
