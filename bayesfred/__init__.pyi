@@ -7,6 +7,7 @@ from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.evidence import Evidence, log_evidence
 from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
+from .analysis.photon_transfer import PhotonTransfer, photon_transfer
 from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.prior_predictive import PriorPredictive, prior_predictive
 from .analysis.sbc import SBCResult, simulation_based_calibration
@@ -51,6 +52,7 @@ __all__ = [
     "MoffatPSF",
     "NoiseStudy",
     "Nuisances",
+    "PhotonTransfer",
     "PhotonsNeeded",
     "PoissonNoise",
     "PolynomialDistortion",
@@ -77,6 +79,7 @@ __all__ = [
     "log_evidence",
     "noise_study",
     "open_chain",
+    "photon_transfer",
     "photons_needed",
     "prior_predictive",
     "reject_outliers",

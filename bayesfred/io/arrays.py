@@ -15,7 +15,7 @@ import numpy.typing as npt
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 
-__all__ = ["frame_given"]
+__all__ = ["frame_given", "stored_values"]
 
 UNITS = ("electron", "photon", "ct", "")
 VARIANCE_POWER = {"std": 2.0, "var": 1.0, "ivar": -1.0}
@@ -55,19 +55,34 @@ def frame_given(
     if getattr(counts, "flags", None) is not None and hasattr(counts, "uncertainty"):
         raise InputError("counts: got a frame with flags, expected a mask: set mask, not flags")
     factor = _electrons(getattr(counts, "unit", None))
-    excluded = getattr(counts, "mask", None)
-    excluded = None if callable(excluded) else excluded
     uncertainty = getattr(counts, "uncertainty", None)
-    values = counts.data if hasattr(counts, "uncertainty") else getattr(counts, "unmasked", counts)
-    values = np.array(getattr(values, "value", values), dtype=np.float64) * factor
-    if excluded is not None and np.any(excluded):
-        bad = np.broadcast_to(np.asarray(excluded, dtype=bool), values.shape)
+    values, bad = _parts(counts)
+    values *= factor
+    if bad is not None:
         values[bad] = np.nan
         used = ~bad if mask is None else np.asarray(mask, dtype=bool)
         mask = used & ~bad if used.shape == bad.shape else used  # shapes are checked elsewhere
     if uncertainty is not None:
         _require_variance(uncertainty, factor, values, variance)
     return values, None if mask is None else np.array(mask, dtype=bool)
+
+
+def stored_values(frame: Any) -> Floats:
+    """The numbers of a frame in its own unit, nan in pixels that it masks, shape (ny, nx)."""
+    values, bad = _parts(frame)
+    if bad is not None:
+        values[bad] = np.nan
+    return values
+
+
+def _parts(frame: Any) -> tuple[Floats, Flags | None]:
+    """A copy of a frame's numbers, and the pixels that it masks, if any."""
+    data = frame.data if hasattr(frame, "uncertainty") else getattr(frame, "unmasked", frame)
+    values = np.array(getattr(data, "value", data), dtype=np.float64)
+    mask = getattr(frame, "mask", None)
+    if mask is None or callable(mask) or not np.any(mask):
+        return values, None
+    return values, np.broadcast_to(np.asarray(mask, dtype=bool), values.shape)
 
 
 def _electrons(unit: Any) -> float:
