@@ -84,6 +84,27 @@ def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
     _run(lambda: bf.show.show_simulated(bf.commands.simulate_frame(run_file, overwrite=overwrite)))
 
 
+@app.command()
+def init(
+    frame: Annotated[Path, typer.Argument(metavar="FRAME", help="A frame.", show_default=False)],
+    second: Annotated[
+        Path | None,
+        typer.Argument(metavar="SECOND", help="Another of the same scene.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="RUN.toml", help="The run file.", show_default="after the frame"
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Propose a run file: gain, pedestal and read noise from the frame's own noise."""
+    _run(
+        lambda: bf.show.show_proposal(bf.commands.init(frame, second, out=out, overwrite=overwrite))
+    )
+
+
 @app.command(epilog="A complete run file:\n\n" + _example())
 def fit(
     run_file: Run,

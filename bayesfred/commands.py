@@ -25,6 +25,7 @@ from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
 from bayesfred.pipeline import Say
+from bayesfred.proposal import init as init
 from bayesfred.records import Compared, Result, Simulated, Study
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.sampling.chainfile import open_chain

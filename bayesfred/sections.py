@@ -265,6 +265,11 @@ def toml(run: Section) -> str:
     return _table((), run.model_dump(exclude_none=True)).strip()
 
 
+def toml_text(text: str) -> str:
+    """A text as TOML quotes it."""
+    return _value(text)
+
+
 def _table(name: tuple[str, ...], table: dict[str, Any]) -> str:
     """A table of TOML with those in it; nothing for one without keys."""
     parts = {key: part for key, part in table.items() if isinstance(part, dict)}

@@ -16,6 +16,7 @@ from rich.console import Console
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
+from bayesfred.proposal import Proposed
 from bayesfred.records import Compared, Result, Simulated, Study
 from bayesfred.reporting import screen
 
@@ -98,6 +99,13 @@ def show_simulated(simulated: Simulated) -> bool:
         print(f"{printable(str(simulated.catalogue))}: {len(posterior.model.sources)} sources")
     shown = f"{ny} x {nx} pixels, {posterior.counts.sum():.0f} counts"
     print(f"{printable(str(simulated.frame))}: {shown}")
+    return True
+
+
+def show_proposal(proposed: Proposed) -> bool:
+    """Print what a frame's noise says, and where the run file is."""
+    print(proposed.message)
+    print(f"{printable(str(proposed.path))}: look at it, give it a catalogue, then bayesfred fit")
     return True
 
 

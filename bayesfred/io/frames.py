@@ -30,7 +30,14 @@ from bayesfred.io.paths import may_write
 from bayesfred.io.reading import readable, require_file
 from bayesfred.io.saturation import plateau
 
-__all__ = ["LARGEST_COUNT", "FrameRecord", "read_frame", "require_memory", "write_frame"]
+__all__ = [
+    "LARGEST_COUNT",
+    "FrameRecord",
+    "read_frame",
+    "read_stored",
+    "require_memory",
+    "write_frame",
+]
 
 _FITS_SUFFIXES = (".fits", ".fit", ".fts")
 _FORMATS = {
@@ -128,7 +135,7 @@ def read_frame(
     'frame.fits: 2 x 2 pixels, 1 masked (1 saturated)'
     """
     path = Path(path)
-    kind = _format(path)
+    _format(path)
     if gain is not None and not (math.isfinite(gain) and gain > 0):
         raise InputError(f"{path}: gain: got {gain}, expected a positive number of e-/adu")
     if pedestal is not None and not math.isfinite(pedestal):
@@ -137,8 +144,7 @@ def read_frame(
         )
     if saturation is not None and not saturation > -math.inf:
         raise InputError(f"{path}: saturation: got {saturation}, expected a level in stored units")
-    require_file(path)
-    image = _READERS[kind](path, name)
+    image = read_stored(path, name)
     stored = image.stored
     known = calibration(path, image.header, gain=gain, pedestal=pedestal, saturation=saturation)
     notes = [*known.notes, *(f"{unused} not used" for unused in image.unused)]
@@ -176,6 +182,31 @@ def read_frame(
     masked = f"{n_masked} masked ({reasons})" if n_masked else "none masked"
     said = "; ".join([f"{_by(stored.shape)} pixels, {masked}", *notes])
     return FrameRecord(counts, valid, n_masked, f"{printable(path.name)}: {said}", known.read_noise)
+
+
+def read_stored(path: PathLike, name: str | None = None) -> StoredImage:
+    """Read one frame as it is stored, with what its file says of it.
+
+    Parameters
+    ----------
+    path : path-like
+        As `read_frame` takes it.
+    name : str, optional
+        FITS extension or HDF5 dataset.
+
+    Returns
+    -------
+    StoredImage
+
+    Raises
+    ------
+    InputError
+        As `read_frame` does of files.
+    """
+    path = Path(path)
+    kind = _format(path)
+    require_file(path)
+    return _READERS[kind](path, name)
 
 
 def write_frame(path: PathLike, counts: ArrayLike, *, overwrite: bool = False) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from bayesfred.errors import InputError, printable
 
-__all__ = ["KEYWORDS", "Calibration", "calibration"]
+__all__ = ["KEYWORDS", "Calibration", "calibration", "noise_in", "units"]
 
 GAIN = ("EGAIN", "GAIN", "CCDGAIN", "ESO DET OUT1 CONAD")  # e-/adu
 READ_NOISE = ("RDNOISE", "READNOIS", "READNOISE", "ENOISE", "ESO DET OUT1 RON")
@@ -82,8 +82,8 @@ def calibration(
     """
     found = _Header(path, header)
     unit = str(header.get("BUNIT", "")).strip()
-    plain = unit.lower().removesuffix("s").removesuffix("-").removesuffix("^")
-    if plain in ELECTRONS:
+    kind = units(header)
+    if kind == "electrons":
         if gain not in (None, 1.0):
             raise InputError(
                 f"{path}: gain: got {gain} for a frame whose BUNIT is {printable(unit)!r}, "
@@ -92,13 +92,13 @@ def calibration(
         found.notes.append(f"in {printable(unit)} (BUNIT)")
         gain = 1.0
     elif gain is None:
-        if plain not in NUMBERS:
+        if kind != "adu":
             raise InputError(
                 f"{path}: BUNIT: got {printable(unit)!r}, expected adu or electrons: give gain "
                 f"(electrons per {printable(unit)}) and pedestal"
             )
         gain = found.take(GAIN, "gain", "e-/adu", least=0.0)
-        if gain is None and plain in ("adu", "dn", "du"):
+        if gain is None and unit.lower().startswith(("adu", "d")):
             raise InputError(
                 f"{path}: BUNIT: got {printable(unit)!r} without a GAIN, expected counts; give "
                 "gain (e-/adu) and pedestal"
@@ -109,7 +109,7 @@ def calibration(
                 "camera's setting, expected electrons per adu: give gain"
             )
     else:
-        if plain not in NUMBERS:
+        if kind != "adu":
             found.notes.append(f"BUNIT {printable(unit)!r} converted by the gain given")
         found.compare(GAIN, gain)
     pedestal = _pedestal(found, pedestal)
@@ -122,6 +122,23 @@ def calibration(
         found.notes.append(f"{found.key(READ_NOISE)} = {read_noise} not used: no read noise")
         read_noise = None
     return Calibration(gain, pedestal, saturation, read_noise, tuple(found.notes))
+
+
+def units(header: Mapping[str, Any]) -> str:
+    """What the numbers are by BUNIT: "electrons", "adu" or, if it is another, the unit itself."""
+    unit = str(header.get("BUNIT", "")).strip()
+    plain = unit.lower().removesuffix("s").removesuffix("-").removesuffix("^")
+    return "electrons" if plain in ELECTRONS else "adu" if plain in NUMBERS else unit
+
+
+def noise_in(header: Mapping[str, Any]) -> tuple[str, float | None]:
+    """A header's gain, pedestal and read noise in words, and the read noise, if it has one."""
+    found = _Header(Path(), header)
+    keys = filter(None, map(found.key, (GAIN, PEDESTAL, READ_NOISE)))
+    words = ", ".join(f"{key} = {printable(str(header[key]))}" for key in keys)
+    read_noise = found.number(READ_NOISE)
+    known = read_noise is not None and 0.0 < read_noise < math.inf
+    return f"in the header {words}" if words else "", read_noise if known else None
 
 
 def _pedestal(found: _Header, given: float | None) -> float:

@@ -1,0 +1,183 @@
+"""A run file proposed for a frame: what its noise, its header and its peaks say.
+
+Gain, pedestal and read noise are those of `analysis.photon_transfer`, with their errors in comments
+beside what the header says. The rest is a start that fits most calibration frames.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from bayesfred._typing import Floats, PathLike
+from bayesfred.analysis.photon_transfer import PhotonTransfer, photon_transfer
+from bayesfred.errors import InputError, printable
+from bayesfred.io.atomic import replace
+from bayesfred.io.fits_images import StoredImage
+from bayesfred.io.frames import read_stored
+from bayesfred.io.headers import noise_in, units
+from bayesfred.io.paths import may_write
+from bayesfred.io.saturation import plateau
+from bayesfred.sections import toml_text
+
+STARS = 30  # peaks by which the PSF's width is measured
+KNOWN = 3.0  # standard deviations of a read noise that is worth a key
+
+TEXT = """\
+# Proposed by `bayesfred init` for {name}: look at every line.
+# `bayesfred fit --help` shows all keys.
+
+[frame]
+path = {path}
+{frame}
+[catalogue]
+path = {catalogue}  # columns x, y: pixels from the frame's middle; fluxes are free
+
+[detector]
+pixel = "box"
+
+[psf]
+sigma = {sigma:.2g}  # pixels, a start: by the brightest peaks
+
+[distortion]
+terms = "polynomial"
+degree = 3
+
+[noise]
+{noise}
+[nuisances]
+flux = "free"
+offset = true
+psf_sigma = true
+background_order = 1
+"""
+
+
+@dataclass(frozen=True)
+class Proposed:
+    """A run file that was proposed.
+
+    Attributes
+    ----------
+    path : Path
+        Of the run file.
+    message : str
+        What the noise of the frame says.
+    """
+
+    path: Path
+    message: str
+
+
+def init(
+    frame: PathLike,
+    second: PathLike | None = None,
+    *,
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> Proposed:
+    """Write a run file for a frame, with gain, pedestal and read noise by photon transfer.
+
+    Parameters
+    ----------
+    frame : path-like
+        As `fit` reads it.
+    second : path-like, optional
+        Another frame of the same scene and exposure, which tells the read noise.
+    out : path-like, optional
+        The run file; by default named after the frame, in the folder that this is started in.
+    overwrite : bool
+        Replace it.
+
+    Returns
+    -------
+    Proposed
+
+    Raises
+    ------
+    InputError
+        If a frame cannot be read, or the run file exists.
+    """
+    frame = Path(frame)
+    stem = frame.name.split(".")[0]
+    path = Path(f"{stem}.toml" if out is None else out)
+    if path.suffix != ".toml":
+        raise InputError(f"{path}: got a run file of this name, expected one ending in .toml")
+    may_write(path, overwrite=overwrite)
+    image = read_stored(frame)
+    others = [image] if second is None else [image, read_stored(Path(second))]
+    used = [_masked(each) for each in others]
+    try:
+        found: PhotonTransfer | None = photon_transfer(*used)
+        message = found.message if found else ""
+    except InputError as error:
+        found, message = None, str(error)
+    keys, noise = _frame_keys(found, message, image)
+    level = plateau(used[0][np.isfinite(used[0])])
+    if level is not None:
+        keys += f"saturation = {level!r}  # suspected: a plateau at the maximum\n"
+    text = TEXT.format(
+        name=printable(frame.name), path=toml_text(str(frame)), frame=keys, noise=noise,
+        catalogue=toml_text(f"{stem}.csv"), sigma=_width(used[0]),
+    )  # fmt: skip
+    replace(path, text.encode())
+    return Proposed(path, message)
+
+
+def _masked(image: StoredImage) -> Floats:
+    """The stored numbers, nan where they are flagged."""
+    bad = ~np.isfinite(image.stored)
+    for flags in image.flags.values():
+        bad |= flags
+    return np.where(bad, np.nan, image.stored)
+
+
+def _frame_keys(found: PhotonTransfer | None, message: str, image: StoredImage) -> tuple[str, str]:
+    """Lines of [frame] and of [noise]."""
+    said, read_noise = noise_in(image.header)
+    comment = f"; {said}" if said else ""
+    if found is None:
+        return f"# gain =   # e-/adu: {message}{comment}\n", "# read_noise =   # e-\n"
+    errors = f"+- {found.gain_sd:.2g} by the frame's noise{comment}"
+    level, level_sd, why = found.zero_level, found.zero_level_sd, "where the noise vanishes"
+    by = "taken as part of the pedestal"
+    if found.frames == 2 and found.read_noise > KNOWN * found.read_noise_sd:
+        read_noise, by = found.read_noise, f"+- {found.read_noise_sd:.2g} by two frames"
+    elif read_noise:
+        by = "by the header"
+    if read_noise:
+        level, why = level + read_noise**2 / found.gain, "for the read noise below"
+    gain = f"gain = {found.gain:.5g}  # e-/adu, {errors}\n"
+    if units(image.header) == "electrons":
+        gain = f"# gain: none, as BUNIT is electrons; {found.gain:.5g} {errors}\n"
+    pedestal = f"pedestal = {level:.6g}  # stored units, +- {level_sd:.2g}: {why}\n"
+    return gain + pedestal, f"read_noise = {read_noise or 0.0:#.4g}  # e-, {by}\n"
+
+
+def _width(image: Floats) -> float:
+    """The width of the brightest peaks, pixels: of a Gaussian, F / 2 pi s^2 is the height."""
+    filled = np.where(np.isfinite(image), image, np.nanmedian(image))
+    filled = (
+        filled
+        - ndimage.median_filter(filled[::4, ::4], 9)
+        .repeat(4, 0)
+        .repeat(4, 1)[: image.shape[0], : image.shape[1]]
+    )
+    smooth = ndimage.gaussian_filter(filled, 1.0)
+    sigma = 1.5
+    for _ in range(3):
+        r = int(np.ceil(3.5 * sigma))
+        peak = smooth == ndimage.maximum_filter(smooth, 2 * r + 1)
+        peak[:r], peak[-r:], peak[:, :r], peak[:, -r:] = False, False, False, False
+        row, column = np.nonzero(peak)
+        brightest = np.argsort(-smooth[row, column])[:STARS]
+        cuts = [
+            filled[j - r : j + r + 1, i - r : i + r + 1]
+            for j, i in zip(row[brightest], column[brightest], strict=True)
+        ]
+        widths = [cut.sum() / (2.0 * np.pi * cut.max()) for cut in cuts if cut.max() > 0.0]
+        if not widths:
+            break
+        sigma = float(np.clip(np.sqrt(max(np.median(widths), 0.0)), 0.5, 20.0))
+    return sigma
