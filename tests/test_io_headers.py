@@ -193,7 +193,10 @@ def test_plateaus_are_suspected_and_nothing_else() -> None:
     one = frames[0].copy()
     one[50, 50] = 65535
     assert plateau(one.ravel()) == 65535.0
-    # neither a frame without light, nor one of a few counts, where ties are the rule
+    # neither numbers far apart, nor a frame without light, nor one of a few counts, where ties are
+    # the rule
+    assert plateau(np.array([0.0, 5e-324, 1.0, 2.0])) is None
+    assert plateau(np.array([-1.7e308, 0.0, 1.0, 1.7e308])) is None
     assert plateau(np.zeros(100)) is None and plateau(np.zeros(0)) is None
     assert plateau(np.random.default_rng(1).poisson(0.1, 10**5).astype(float)) is None
 

@@ -42,10 +42,12 @@ def plateau(stored: Floats) -> float | None:
     top = float(stored.max())
     if top in FULL_SCALE:
         return top
-    steps = np.diff(np.unique(stored[:: max(1, stored.size // SAMPLE)]))
+    with np.errstate(over="ignore"):
+        steps = np.diff(np.unique(stored[:: max(1, stored.size // SAMPLE)]))
     if not steps.size:
         return None
-    levels = int(TOP * (top - float(np.median(stored))) / float(steps.min()))
+    # infinite where steps are as small as floats can be
+    levels = np.floor(TOP * (top - float(np.median(stored))) / float(steps.min()))
     if levels < 2:
         return None
     others = int(np.sum(stored > top - levels * steps.min())) - 1
