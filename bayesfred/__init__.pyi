@@ -17,13 +17,15 @@ from .imaging.detector import Detector, correct_sampling, sampling_matrix
 from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
-from .imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
+from .imaging.psf import GaussianPSF, MeasuredPSF, MoffatPSF, SampledPSF
 from .model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from .model.parameters import Nuisances
 from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
+from .optimize.fit_psf import fit_psf
 from .optimize.follow import follow_images
+from .optimize.measure_psf import marginalize_psf, measure_psf
 from .optimize.uncatalogued import UncataloguedSources, find_uncatalogued
 from .sampling.chain import Chain
 from .sampling.chainfile import open_chain
@@ -49,6 +51,7 @@ __all__ = [
     "LaplaceMove",
     "LogDistortion",
     "MapEstimate",
+    "MeasuredPSF",
     "MoffatPSF",
     "NoiseStudy",
     "Nuisances",
@@ -74,9 +77,12 @@ __all__ = [
     "find_causes",
     "find_map",
     "find_uncatalogued",
+    "fit_psf",
     "follow_images",
     "laplace",
     "log_evidence",
+    "marginalize_psf",
+    "measure_psf",
     "noise_study",
     "open_chain",
     "photon_transfer",

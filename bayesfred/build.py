@@ -1,6 +1,7 @@
 """From the settings of a run file to the objects that they describe."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,7 +13,7 @@ from bayesfred.errors import InputError, printable
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import PSF
+from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFFile, PSFToMeasure, has_pixel
 from bayesfred.io.catalogues import read_catalogue
 from bayesfred.io.frames import FrameRecord, read_frame, require_memory
 from bayesfred.io.paths import resolve
@@ -68,6 +69,8 @@ def catalogue(
 
 def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
     """The PSF of [psf]."""
+    if run.psf.made is PSFFile:
+        return MeasuredPSF.read(resolve(run.psf.path, run_file, must_exist=True))
     arrays = list(run.psf.given)
     if not arrays:
         return cast(PSF, run.psf.make())
@@ -89,6 +92,8 @@ def forward_model(
 ) -> ForwardModel:
     """The forward model of [detector], [distortion] and [model]."""
     detector: Detector = run.detector.make(shape=shape)
+    if has_pixel(psf):
+        detector = replace(detector, pixel="impulse")
     distortion = run.distortion.make(radius=0.5 * math.hypot(*detector.fine_shape))
     m = run.model
     return ForwardModel(
@@ -122,13 +127,16 @@ def posterior_given(
     noise: Noise,
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
+    nuisances = run.nuisances.make()
+    if isinstance(model.psf, PSFToMeasure):  # its width is looked for first
+        nuisances = replace(nuisances, psf_sigma=True)
     return Posterior(
         model,
         counts,
         prior=priors_given(run),
         noise=noise,
         mask=mask,
-        nuisances=run.nuisances.make(),
+        nuisances=nuisances,
     )
 
 

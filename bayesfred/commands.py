@@ -21,6 +21,7 @@ from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.sbc import SBCResult, simulation_based_calibration
 from bayesfred.errors import InputError
+from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
@@ -293,6 +294,8 @@ def report(
     page, *others = outputs.beside(path if out is None else Path(out))
     if out is not None:
         page = Path(out)
+    if isinstance(chain.posterior().model.psf, MeasuredPSF):
+        others.append(outputs.psf_beside(page))
     outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
     target = target_ess or chain.target_ess
     return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)

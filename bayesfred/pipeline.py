@@ -19,11 +19,13 @@ from bayesfred.analysis.field import displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import SBCResult
 from bayesfred.errors import InputError, printable
+from bayesfred.imaging.psf import FWHM, PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
+from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.records import Result, Study
 from bayesfred.reporting.figures import page_figures
@@ -150,6 +152,10 @@ def read_frame(
             posterior, estimate = choice.posterior, choice.estimate
             for line in choice.lines():
                 note(line)
+        if has_pixel(posterior.model.psf) or isinstance(psf, PSFToMeasure):
+            with searching() if say else nullcontext():
+                posterior, estimate = _with_measured_psf(posterior, estimate, psf)
+            note(_described_psf(posterior))
     return posterior, estimate, notes
 
 
@@ -168,6 +174,30 @@ def _follow(posterior: Posterior) -> tuple[Posterior, MapEstimate, list[str]]:
         followed = replace(followed, mask=found.mask, extrapolation=None)
         estimate = find_map(followed)
     return followed, estimate, lines
+
+
+def _with_measured_psf(
+    posterior: Posterior, estimate: MapEstimate | None, psf: PSF
+) -> tuple[Posterior, MapEstimate]:
+    """The posterior with the errors of its PSF, which is measured first if that is asked for."""
+    estimate = estimate or find_map(posterior)
+    if isinstance(psf, PSFToMeasure):
+        return measure_psf(posterior, estimate, oversampling=psf.oversampling, degree=psf.degree)
+    posterior = marginalize_psf(posterior, estimate)
+    return posterior, find_map(posterior, estimate.params)
+
+
+def _described_psf(posterior: Posterior) -> str:
+    """What was found of a measured PSF."""
+    psf = posterior.model.psf
+    assert isinstance(psf, MeasuredPSF), "one was measured"
+    here = "" if posterior.loss is None or posterior.loss.absorbed else " on another frame"
+    varies = f", varying with degree {psf.degree} over the field" if psf.degree else ""
+    left = f"{psf.model_error:.1%} of the light unexplained"
+    return (
+        f"psf: measured{here}, FWHM {FWHM * psf.sigma:.2f} pixel with the pixel in it{varies}, "
+        f"{psf.determined:.0f} numbers determined, {left if psf.model_error else 'noise is left'}"
+    )
 
 
 def _census(posterior: Posterior, kept: Posterior) -> str:
@@ -219,7 +249,9 @@ def fit_frame(
         raise InputError(
             f"{output}: no folder {output.parent}, expected one to write the chain to: create it"
         )
-    others = outputs.beside(output)
+    others: tuple[Path, ...] = outputs.beside(output)
+    if isinstance(posterior.model.psf, MeasuredPSF):
+        others += (outputs.psf_beside(output),)
     hidden = (output.with_name(f".{output.name}.{kind}") for kind in ("lock", "tmp", "writer"))
     for path in (output, *others, *hidden):
         if os.path.islink(path) or os.path.isdir(path):
@@ -317,6 +349,8 @@ def write_results(
         result=field.message,
     )
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
+    if isinstance(posterior.model.psf, MeasuredPSF):
+        posterior.model.psf.write(outputs.psf_beside(page), overwrite=True)
     found = diagnostics.sources
     columns = {name: found[name].data for name in found.colnames}
     tables.write_table(sources, tables.TableRecord(columns, SOURCES_META), overwrite=True)

@@ -100,7 +100,8 @@ def require_sources(folds: Folds) -> None:
 
 
 def _masked(posterior: Posterior, mask: Flags) -> Posterior:
-    return replace(posterior, mask=mask, extrapolation=None)
+    # the errors of a measured PSF are common to all folds
+    return replace(posterior, mask=mask, extrapolation=None, loss=None)
 
 
 def _path(positions: Floats) -> Ints:

@@ -24,7 +24,7 @@ from bayesfred.imaging.distortion import Distortion, PolynomialDistortion
 from bayesfred.imaging.kernels.contexts import Basis, Degrees, Optics, SourceNuisances, stride
 from bayesfred.imaging.kernels.jacobian import jacobian
 from bayesfred.imaging.kernels.render import render
-from bayesfred.imaging.psf import FWHM, PSF
+from bayesfred.imaging.psf import FWHM, PSF, density_at, has_pixel, profile_of
 from bayesfred.io.serialize import serializable
 
 # An impulse-sampled Gaussian's counts ripple with its sub-pixel position by 4 exp(-2 pi^2 sigma^2):
@@ -84,7 +84,14 @@ class ForwardModel:
     def __post_init__(self) -> None:
         if not 0.0 <= self.tolerance < 1.0:
             raise InputError(f"model: tolerance: got {self.tolerance}, expected 0 <= tolerance < 1")
-        if self.detector.pixel == "impulse" and self.psf.sigma < NARROWEST_IMPULSE:
+        if has_pixel(self.psf):
+            if self.detector.pixel != "impulse" or self.detector.binning != 1:
+                raise InputError(
+                    "psf: got a measured PSF, which has the pixel's response in it, and a detector "
+                    f"with pixel = {self.detector.pixel!r} and binning = {self.detector.binning}, "
+                    "expected 'impulse' and 1"
+                )
+        elif self.detector.pixel == "impulse" and self.psf.sigma < NARROWEST_IMPULSE:
             raise InputError(
                 f"psf: sigma: got {self.psf.sigma:.4g} pixel with pixel = 'impulse', narrower "
                 "than the pixel: expected at least "
@@ -118,7 +125,7 @@ class ForwardModel:
             width if narrowest is None else width * narrowest / self.psf.sigma, beta
         )
         return Optics(
-            psf=self.psf.profile,
+            psf=profile_of(self.psf, self.sources.x, self.sources.y),
             x=self.sources.x,
             y=self.sources.y,
             f_powers=f[:, 2:].copy(),
@@ -200,7 +207,7 @@ class ForwardModel:
         out = np.zeros(self.detector.shape)
         for x, y, flux in zip(self.sources.x, self.sources.y, self.sources.flux, strict=True):
             f, g = self.distortion.displacement((), u, v, x, y)
-            kernel = flux * self.psf.density(u - x + f, v - y + g)
+            kernel = flux * density_at(self.psf, u - x + f, v - y + g, (x, y))
             if self.conserve_flux:
                 kernel *= np.abs(self.distortion.determinant((), u, v, x, y))
             out += np.einsum("jqip,q,p->ji", kernel, weights, weights, optimize=True)

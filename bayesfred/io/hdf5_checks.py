@@ -21,7 +21,7 @@ from h5py import h5a, h5d, h5l, h5o, h5t, h5z
 from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
-SCHEMA = 5
+SCHEMA = 6
 READABLE = (3, 4, 5)  # not all that it may hold; see `sampling/chainfile`
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))

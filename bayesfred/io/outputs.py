@@ -12,7 +12,7 @@ from bayesfred.errors import InputError
 from bayesfred.io import atomic
 from bayesfred.io.paths import may_write
 
-__all__ = ["beside", "beside_study", "make_folder", "may_write_page"]
+__all__ = ["beside", "beside_study", "make_folder", "may_write_page", "psf_beside"]
 
 
 def beside(path: Path) -> tuple[Path, Path, Path]:
@@ -33,6 +33,25 @@ def beside(path: Path) -> tuple[Path, Path, Path]:
     """
     page, picture, sources = (path.with_suffix(s) for s in (".html", ".png", ".sources.ecsv"))
     return page, picture, sources
+
+
+def psf_beside(path: Path) -> Path:
+    """Name the file of a PSF that was measured with a chain.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Path
+
+    Examples
+    --------
+    >>> psf_beside(Path("run.h5")).name
+    'run.psf.fits'
+    """
+    return path.with_suffix(".psf.fits")
 
 
 def beside_study(table: Path) -> tuple[Path, Path]:

@@ -15,10 +15,12 @@ import numpy.typing as npt
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.psf import PSF, has_pixel
 from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
+from bayesfred.model.information_loss import InformationLoss
 from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
@@ -50,6 +52,8 @@ class Posterior(TargetDensity):
         Where free fluxes have their maximum near some parameters: `near` makes it.
     valid : array_like of bool, shape (ny, nx), optional
         True where a pixel may be used when the footprint moves; by default `mask`.
+    loss : InformationLoss, optional
+        What the errors of a measured PSF take from the parameters: `marginalize_psf` finds it.
 
     Attributes
     ----------
@@ -62,7 +66,8 @@ class Posterior(TargetDensity):
     InputError
         If the frame does not fit the detector, is in another unit or has other uncertainties, holds
         values that no noise model explains, every pixel is masked, no source lies in the frame, or
-        a prior is unusable; if the extrapolation is of another model.
+        a prior is unusable; if the extrapolation is of another model, or the loss of other
+        parameters.
 
     Examples
     --------
@@ -83,6 +88,7 @@ class Posterior(TargetDensity):
     nuisances: Nuisances
     extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
     valid: Flags = field(metadata={"stored": False})
+    loss: InformationLoss | None = field(metadata={"since": 6})
 
     def __init__(
         self,
@@ -95,6 +101,7 @@ class Posterior(TargetDensity):
         nuisances: Nuisances = Nuisances(),
         extrapolation: FluxExtrapolation | None = None,
         valid: npt.ArrayLike | None = None,
+        loss: InformationLoss | None = None,
     ) -> None:
         frame, mask = frame_given(counts, mask, getattr(noise, "variance", None))
         used = usable_pixels(model, frame, mask, noise, nuisances)
@@ -106,11 +113,16 @@ class Posterior(TargetDensity):
             )
         values: tuple[Any, ...] = (
             model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
-            extrapolation, np.array(valid, dtype=bool),
+            extrapolation, np.array(valid, dtype=bool), loss,
         )  # fmt: skip
         for name, value in zip((f.name for f in fields(self)), values, strict=True):
             object.__setattr__(self, name, value)
         object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
+        if loss is not None and loss.names != self.parameter_names:
+            raise InputError(
+                f"loss: got one of {', '.join(loss.names)}, expected one of "
+                f"{', '.join(self.parameter_names)}"
+            )
 
     @cached_property
     def likelihood(self) -> FrameLikelihood:
@@ -176,6 +188,8 @@ class Posterior(TargetDensity):
         prior = self._log_prior(vectors)
         out = self.likelihood.log_likelihood(vectors, prior > -np.inf)
         out = np.where(out > -np.inf, out + prior, out)
+        if self.loss is not None:
+            out += self.loss.log_factor(vectors)
         out[np.isnan(prior)] = np.nan
         return float(out[0]) if np.ndim(params) == 1 else out
 
@@ -190,7 +204,8 @@ class Posterior(TargetDensity):
         if not np.isfinite(self.log_prior(vector)[0]):
             return np.full(vector.size, np.nan)
         slopes = [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
-        return self.likelihood.gradient(vector) + slopes
+        slope = self.likelihood.gradient(vector) + slopes
+        return slope if self.loss is None else slope + self.loss.gradient(vector)
 
     def fisher(self, params: npt.ArrayLike) -> Floats:
         """Fisher information of the frame about the parameters, free fluxes profiled out.
@@ -206,11 +221,14 @@ class Posterior(TargetDensity):
         return self.likelihood.fisher(vector)
 
     def information(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information plus prior curvature, shape (d, d).
+        """Fisher information plus prior curvature less what is lost, shape (d, d).
 
         The inverse is the covariance of the Laplace approximation.
         """
-        return self.fisher(params) + self.prior_information(params)
+        given = self.fisher(params) + self.prior_information(params)
+        if self.loss is None or not np.isfinite(given).all():
+            return given
+        return self.loss.left_of(given)
 
     def prior_information(self, params: npt.ArrayLike) -> Floats:
         """Curvature of the prior where it is positive, shape (d, d)."""
@@ -243,6 +261,30 @@ class Posterior(TargetDensity):
         if close is self.likelihood:
             return self
         return replace(self, extrapolation=close.extrapolation)
+
+    def with_psf(self, psf: PSF) -> "Posterior":
+        """The same posterior with another PSF, and without what errors of a PSF took from it.
+
+        A PSF that has the pixel's response in it is sampled at the pixels' centres, and its width
+        is no parameter.
+
+        Parameters
+        ----------
+        psf : PSF
+
+        Returns
+        -------
+        Posterior
+        """
+        detector, nuisances, prior = self.model.detector, self.nuisances, dict(self.prior)
+        if has_pixel(psf):
+            detector = replace(detector, pixel="impulse")
+            nuisances = replace(nuisances, psf_sigma=False)
+            prior.pop("psf_sigma", None)
+        model = replace(self.model, psf=psf, detector=detector)
+        return replace(
+            self, model=model, prior=prior, nuisances=nuisances, extrapolation=None, loss=None
+        )
 
     def simulate(
         self,

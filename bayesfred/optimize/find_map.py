@@ -157,7 +157,8 @@ def _search(
             if top is None:
                 fisher = posterior.fisher(begun.params)
                 _require_determined(posterior, begun.params, fisher)
-                information = fisher + posterior.prior_information(begun.params)
+                if posterior.loss is None:
+                    information = fisher + posterior.prior_information(begun.params)
             kept, origin, spent = rejecting(posterior, begun.params)
             known = information if origin is begun.params else None
             again = maximize(kept.posterior, origin, information=known)

@@ -253,5 +253,6 @@ def _part(posterior: Posterior, missing: Flags, mask: Flags) -> Posterior:
         return posterior
     noise, nuisances = posterior.noise, posterior.nuisances
     return Posterior(
-        model, posterior.counts, prior=posterior.prior, noise=noise, mask=mask, nuisances=nuisances
-    )
+        model, posterior.counts, prior=posterior.prior, noise=noise, mask=mask,
+        nuisances=nuisances, loss=posterior.loss,
+    )  # fmt: skip

@@ -14,11 +14,13 @@ from matplotlib.figure import Figure
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.analysis.field import DisplacementField
+from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.field import field_plot
 from bayesfred.reporting.frames import MAX_STARS, FittedFrame, frame_triptych, star_panels
 from bayesfred.reporting.goodness import described_residuals, residual_panels
 from bayesfred.reporting.posteriors import corner_plot, marginal_plot, trace_plot
+from bayesfred.reporting.psf import described_psf, psf_panels
 from bayesfred.sampling.chain import Chain
 
 __all__ = ["PageFigure", "described_residual", "page_figures"]
@@ -100,6 +102,7 @@ def page_figures(
             _described_stars(fitted, u, v),
             star_panels(fitted, u, v, half_width=half_width),
         ),
+        *_psf_figures(posterior),
         *_residual_figures(diagnostics, posterior),
         *_posterior_figures(chain, shown, truth),
     ]
@@ -114,6 +117,23 @@ def page_figures(
             )
         )
     return figures
+
+
+def _psf_figures(posterior: Posterior) -> list[PageFigure]:
+    """The PSF, if it was measured."""
+    psf = posterior.model.psf
+    if not isinstance(psf, MeasuredPSF):
+        return []
+    return [
+        PageFigure(
+            "Point spread function",
+            "As measured, with the pixel's response in it; bands hold 95 % of the draws from its "
+            f"posterior. {psf.determined:.0f} numbers of it are determined by the counts; it "
+            f"leaves {psf.model_error:.1%} of the light unexplained.",
+            described_psf(psf),
+            psf_panels(psf, posterior.model.detector.shape),
+        )
+    ]
 
 
 def _residual_figures(diagnostics: Diagnostics, posterior: Posterior) -> list[PageFigure]:

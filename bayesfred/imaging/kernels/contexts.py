@@ -57,6 +57,7 @@ class Geometry(NamedTuple):
     peak: Floats  # (s, 2) u, v
     ellipse: Floats  # (s, 4) alpha, beta, gamma, R^2: alpha t^2 + 2 beta t w + gamma w^2 <= R^2
     rows: Ints  # (s, 2) first row and the one after the last
+    first: int  # number of the first source, where these are some of all
 
 
 class Source(NamedTuple):
@@ -68,6 +69,7 @@ class Source(NamedTuple):
     d: Floats
     u: float
     v: float
+    number: int  # among all sources
 
 
 class Footprints(NamedTuple):

@@ -51,7 +51,7 @@ def new_geometry(o):
     a, b = np.empty((size, n, n)), np.empty((size, n, n))
     q, d = np.empty((size, n_q, n_q)), np.empty((size, n_d, n_d))
     peak, ellipse, rows = np.empty((size, 2)), np.empty((size, 4)), np.empty((size, 2), np.int64)
-    return Geometry(a, b, q, d, peak, ellipse, rows)
+    return Geometry(a, b, q, d, peak, ellipse, rows, 0)
 
 
 @inner()
@@ -64,7 +64,17 @@ def new_work(o):
 def one_source(geometry, s):
     """Source s alone."""
     u, v = geometry.peak[s, 0], geometry.peak[s, 1]
-    return Source(geometry.a[s], geometry.b[s], geometry.q[s], geometry.d[s], u, v)
+    number = geometry.first + s
+    return Source(geometry.a[s], geometry.b[s], geometry.q[s], geometry.d[s], u, v, number)
+
+
+@inner()
+def some_sources(geometry, first, last):
+    """The sources from first to last - 1."""
+    every = slice(first, last)
+    a, b, q, d = geometry.a[every], geometry.b[every], geometry.q[every], geometry.d[every]
+    peak, ellipse, rows = geometry.peak[every], geometry.ellipse[every], geometry.rows[every]
+    return Geometry(a, b, q, d, peak, ellipse, rows, geometry.first + first)
 
 
 @inner()

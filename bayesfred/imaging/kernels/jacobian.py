@@ -21,7 +21,11 @@ from bayesfred.imaging.kernels.geometry import (
     one_source,
 )
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-from bayesfred.imaging.kernels.psf_dispatch import psf_second_derivatives, psf_slopes
+from bayesfred.imaging.kernels.psf_dispatch import (
+    psf_of_source,
+    psf_second_derivatives,
+    psf_slopes,
+)
 
 
 class Line(NamedTuple):
@@ -56,9 +60,16 @@ class Sampler(NamedTuple):
 
 @inner()
 def new_sampler(layout):
-    """The sampler of a layout's sources."""
+    """The sampler of a layout's sources; `of_source` makes one source's of it."""
     o = layout.optics
     return Sampler(o.psf, 1.0 / layout.sigma, layout.work, o.degrees)
+
+
+@inner()
+def of_source(sampler, source):
+    """The sampler of one source."""
+    psf, inverse, work, degrees = sampler
+    return Sampler(psf_of_source(psf, source.number), inverse, work, degrees)
 
 
 class PixelGrid(NamedTuple):
@@ -254,7 +265,8 @@ def basis_row(rows, source, u_row, v_row, n, template):
     templates see `samples_row`. The number comes as an np.int64: of a literal one this function
     would be compiled again.
     """
-    sampler, offsets, weights, ramp, f, g, is_wider, out, buffer, powers = rows
+    every, offsets, weights, ramp, f, g, is_wider, out, buffer, powers = rows
+    sampler = of_source(every, source)
     work, degree, conserves = sampler.work, sampler.degrees.ab, len(sampler.degrees.d) > 0
     ra, rb, rav, rbv, slope = work[2], work[3], work[4], work[5], work[6]
     n_f, n_g, top = f.shape[0], g.shape[0], len(degree)

@@ -14,6 +14,9 @@ polynomial on a row of pixels:
     radial_scale(psf)                c
     radial(psf, z)                   p where z = c (a^2 + b^2)
 
+A family that varies over the field has instead `of_source(psf, s)`: the compiled half of another
+family, the PSF of source s.
+
 The classes in `imaging/psf` are examples. One that is defined outside the package works like them.
 """
 
@@ -43,6 +46,14 @@ psf_slopes = by_type(lambda family: family.slopes)
 psf_second_derivatives = by_type(lambda family: family.second_derivatives)
 _radial_scale = by_type(lambda family: family.radial_scale)
 _radial = by_type(lambda family: family.radial)
+
+
+def _of_field(psf, s):
+    return psf
+
+
+# The PSF of source s, counted among all of the catalogue.
+psf_of_source = by_type(lambda family: getattr(family, "of_source", _of_field))
 
 
 def _fill_radial(psf, source, w, sigma, work, degrees):

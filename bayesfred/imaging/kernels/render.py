@@ -5,11 +5,23 @@ two Horner sweeps and one exponential.
 """
 
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.contexts import Canvas, Geometry
+from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import FAST
-from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, one_source, row_starts
+from bayesfred.imaging.kernels.geometry import (
+    lay_out,
+    locate,
+    new_geometry,
+    one_source,
+    row_starts,
+    some_sources,
+)
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-from bayesfred.imaging.kernels.psf_dispatch import fill_psf_row, psf_on_row, psf_slopes
+from bayesfred.imaging.kernels.psf_dispatch import (
+    fill_psf_row,
+    psf_of_source,
+    psf_on_row,
+    psf_slopes,
+)
 
 # sources whose rows are listed at a time: of many sources the list would outgrow the caches
 BATCH = 32
@@ -30,7 +42,8 @@ def add_source(layout, s, rows, flux, canvas, alone):
     lows, js, sizes = fp.low, fp.row, fp.size
     out, at = canvas.image, canvas.at
     middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
-    r, rd, ra, rb, ramp, psf = work[0], work[1], work[2], work[3], o.ramp, o.psf
+    r, rd, ra, rb, ramp = work[0], work[1], work[2], work[3], o.ramp
+    psf = psf_of_source(o.psf, source.number)
     degrees = o.degrees
     d_top = len(degrees.d)
     norm = flux * psf.norm / (sigma * sigma)
@@ -67,7 +80,7 @@ def add_templates(layout, s, flux, stamps, wider):
     source = one_source(layout.geometry, s)
     offsets, weights, step, ramp = o.offsets, o.weights, o.step, o.ramp
     rd, ra, rb = work[1], work[2], work[3]
-    degrees = o.degrees
+    psf, degrees = psf_of_source(o.psf, source.number), o.degrees
     d_top, top, inverse = len(degrees.d), len(degrees.ab), 1.0 / sigma
     for i in range(fp.first[s], fp.first[s + 1]):
         w = (fp.row[i] - 0.5 * (o.ny - 1)) * step - source.v
@@ -78,7 +91,7 @@ def add_templates(layout, s, flux, stamps, wider):
         for y in range(offsets.size):
             map_on_row(source, w + offsets[y], work, degrees.ab)
             for x in range(offsets.size):
-                weight = weights[y] * weights[x] * o.psf.norm / (sigma * sigma)
+                weight = weights[y] * weights[x] * psf.norm / (sigma * sigma)
                 polynomial_on_row(source.d, w + offsets[y], weight, rd, degrees.d)
                 t0 = t_low + offsets[x]
                 for n in range(row.size):
@@ -90,7 +103,7 @@ def add_templates(layout, s, flux, stamps, wider):
                     for m in range(top):
                         a = a * t + ra[top - 1 - m]
                         b = b * t + rb[top - 1 - m]
-                    k, k_a, k_b = psf_slopes(o.psf, inverse * a, inverse * b)
+                    k, k_a, k_b = psf_slopes(psf, inverse * a, inverse * b)
                     row[n] += k * abs(j)
                     row_a[n] += flux * inverse * k_a * abs(j)
                     row_b[n] += flux * inverse * k_b * abs(j)
@@ -104,12 +117,10 @@ def render(o, theta, nuisances, flux, out):
     geometry = new_geometry(o)
     unfolded = locate(o, theta, nuisances, geometry)
     for s in range(0, flux.size, BATCH):
-        e = s + BATCH
-        a, b, q, d = geometry.a[s:e], geometry.b[s:e], geometry.q[s:e], geometry.d[s:e]
-        peak, ellipse, rows = geometry.peak[s:e], geometry.ellipse[s:e], geometry.rows[s:e]
-        layout = lay_out(o, Geometry(a, b, q, d, peak, ellipse, rows), nuisances.psf_sigma)
+        part = some_sources(geometry, s, s + BATCH)
+        layout = lay_out(o, part, nuisances.psf_sigma)
         fp = layout.footprints
         canvas = Canvas(out, row_starts(fp, out.size // o.ny))
-        for i in range(peak.shape[0]):
+        for i in range(part.peak.shape[0]):
             add_source(layout, i, (fp.first[i], fp.first[i + 1]), flux[s + i], canvas, None)
     return unfolded

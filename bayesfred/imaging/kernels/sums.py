@@ -17,6 +17,7 @@ from bayesfred.imaging.kernels.jacobian import (
     Line,
     Samples,
     new_sampler,
+    of_source,
     pixel_grid,
     samples_row,
     widens,
@@ -134,7 +135,7 @@ def _add_moments(sums, moments, w):
 def _sample_sums(layout, source, rows, template, weight, buffers):
     """Fill the sums of A, B and E over these rows of the footprints; returns that of P |D|."""
     # what the rows share is taken out of the tuples once, see `Sampler`
-    o, fp, sampler = layout.optics, layout.footprints, new_sampler(layout)
+    o, fp, sampler = layout.optics, layout.footprints, of_source(new_sampler(layout), source)
     lows, sizes, starts, numbers = fp.low, fp.size, fp.start, fp.row
     offsets, weights, ramp = o.offsets, o.weights, o.ramp
     middle_u, middle_v, step = pixel_grid(layout)

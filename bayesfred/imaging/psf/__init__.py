@@ -5,8 +5,21 @@ compiled loops.
 """
 
 from bayesfred.imaging.psf.gaussian import GaussianPSF
+from bayesfred.imaging.psf.measured import MeasuredPSF, PSFFile, PSFToMeasure
 from bayesfred.imaging.psf.moffat import MoffatPSF
-from bayesfred.imaging.psf.protocol import FWHM, PSF
+from bayesfred.imaging.psf.protocol import FWHM, PSF, density_at, has_pixel, profile_of
 from bayesfred.imaging.psf.sampled import SampledPSF
 
-__all__ = ["FWHM", "PSF", "GaussianPSF", "MoffatPSF", "SampledPSF"]
+__all__ = [
+    "FWHM",
+    "PSF",
+    "GaussianPSF",
+    "MeasuredPSF",
+    "MoffatPSF",
+    "PSFFile",
+    "PSFToMeasure",
+    "SampledPSF",
+    "density_at",
+    "has_pixel",
+    "profile_of",
+]

@@ -5,7 +5,9 @@ FWHM = 2.355 sigma. Where inference leaves the width free, this is the parameter
 whole, p(a s, b s) s^2 with s the ratio of widths. Lengths are in pixels of the fine grid.
 
 A family is one module with two classes: the public frozen dataclass, and its compiled half, which
-is described in `imaging/kernels/psf_dispatch`.
+is described in `imaging/kernels/psf_dispatch`. One that varies over the field, or has the pixel's
+response in it, has more attributes, see `measured.py`; the functions here answer for those that do
+not.
 """
 
 import math
@@ -51,3 +53,22 @@ class PSF(Protocol):
     def density(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Floats:
         """p at (a, b), pixel from the middle; per square pixel."""
         ...
+
+
+def has_pixel(psf: PSF) -> bool:
+    """Whether the pixel's response is part of the PSF."""
+    return bool(getattr(psf, "has_pixel", False))
+
+
+def profile_of(psf: PSF, x: Floats, y: Floats) -> Any:
+    """The compiled half of a PSF for sources at these positions, shape (s,), pixel."""
+    varying = getattr(psf, "profile_of", None)
+    return psf.profile if varying is None else varying(x, y)
+
+
+def density_at(
+    psf: PSF, a: npt.ArrayLike, b: npt.ArrayLike, position: tuple[float, float]
+) -> Floats:
+    """p at (a, b) of a source at a position x, y on the field, pixel; per square pixel."""
+    at: dict[str, Any] = {"at": position} if hasattr(psf, "profile_of") else {}
+    return psf.density(a, b, **at)

@@ -66,6 +66,18 @@ class SplineProfile(NamedTuple):
         )
 
 
+class FieldProfile(NamedTuple):
+    """A spline for every source, see `imaging/kernels/psf_dispatch`."""
+
+    norm: float
+    c: Floats  # (s, n, n)
+    scale: float
+
+    @staticmethod
+    def of_source(psf: Any, s: Any) -> Any:
+        return SplineProfile(psf.norm, psf.c[s], psf.scale)
+
+
 @nb.njit(inline="always")
 def _cell(size: Any, x: Any) -> Any:
     """The first of the four coefficients that matter at x, and where x is in the cell.
@@ -195,7 +207,7 @@ class SampledPSF:
                 f"{MOST_SAMPLES}"
             )
         with np.errstate(over="ignore", invalid="ignore"):
-            total, scale = float(values.sum()), float(_coefficients(values).sum())
+            total, scale = float(values.sum()), float(spline_coefficients(values).sum())
         if not (0.0 < total < math.inf and 0.0 < scale < math.inf):
             raise InputError(
                 f"psf: values: got a sum of {total:.4g}, expected a positive one: subtract less "
@@ -294,13 +306,15 @@ class SampledPSF:
     @cached_property
     def _spline(self) -> Floats:
         """The spline's coefficients in units of their sum, with zeros around them."""
-        c = _coefficients(self.values)
+        c = spline_coefficients(self.values)
         return np.pad(c / c.sum(), MARGIN)
 
     @cached_property
     def peak(self) -> float:
         """Largest sample, per square pixel."""
-        return float(self.values.max() / _coefficients(self.values).sum() * self.oversampling**2)
+        return float(
+            self.values.max() / spline_coefficients(self.values).sum() * self.oversampling**2
+        )
 
     @cached_property
     def sigma(self) -> float:
@@ -345,10 +359,18 @@ class SampledPSF:
         return np.asarray(self.oversampling**2 * values.reshape(at.shape[1:]))
 
 
-def _coefficients(values: Floats) -> Floats:
+def spline_coefficients(values: Floats) -> Floats:
     """Coefficients of the cubic spline through the values.
 
     Along either axis (c[i - 1] + 4 c[i] + c[i + 1]) / 6 = value, with zeros outside.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, n)
+
+    Returns
+    -------
+    ndarray, shape (n, n)
     """
     bands = np.array([np.full(len(values), 1.0 / 6.0), np.full(len(values), 4.0 / 6.0)])
     return np.asarray(linalg.solveh_banded(bands, linalg.solveh_banded(bands, values).T).T)

@@ -15,7 +15,6 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.contexts import Geometry
 from bayesfred.imaging.kernels.geometry import (
     find_footprints,
     lay_out,
@@ -23,6 +22,7 @@ from bayesfred.imaging.kernels.geometry import (
     move,
     new_geometry,
     one_source,
+    some_sources,
 )
 from bayesfred.imaging.kernels.polynomials import map_on_row
 from bayesfred.imaging.kernels.render import BATCH, add_templates
@@ -66,16 +66,8 @@ def own_pixels(o, parameters, placed, radius, frame):
     image = geometry.peak.copy()
     used = 0
     for begin in range(0, size, BATCH):
-        e = begin + BATCH
-        a, b, q, d = (
-            geometry.a[begin:e],
-            geometry.b[begin:e],
-            geometry.q[begin:e],
-            geometry.d[begin:e],
-        )
-        part = Geometry(
-            a, b, q, d, geometry.peak[begin:e], geometry.ellipse[begin:e], geometry.rows[begin:e]
-        )
+        part = some_sources(geometry, begin, begin + BATCH)
+        a, b = part.a, part.b
         layout = lay_out(o, part, nuisances.psf_sigma)
         fp = layout.footprints
         stamps = np.zeros((TEMPLATES, fp.start[fp.row.size]))

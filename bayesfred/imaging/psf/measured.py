@@ -1,0 +1,389 @@
+"""A PSF that was measured on the images of a frame's sources, with its errors."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from bayesfred._typing import Floats, PathLike
+from bayesfred.errors import InputError
+from bayesfred.imaging.psf.gaussian import GaussianPSF
+from bayesfred.imaging.psf.sampled import MARGIN, MOST_SAMPLES, FieldProfile, SplineProfile
+from bayesfred.io import psf_images
+from bayesfred.io.serialize import serializable
+
+CELLS = 201  # a side, by which the area above half the peak is counted
+
+
+def field_powers(degree: int) -> tuple[tuple[int, int], ...]:
+    """Powers of x and y of a polynomial's terms, the constant first.
+
+    Parameters
+    ----------
+    degree : int
+
+    Returns
+    -------
+    tuple of (int, int)
+
+    Examples
+    --------
+    >>> field_powers(1)
+    ((0, 0), (1, 0), (0, 1))
+    """
+    return tuple((k - j, j) for k in range(degree + 1) for j in range(k + 1))
+
+
+def field_terms(x: npt.ArrayLike, y: npt.ArrayLike, degree: int, radius: float) -> Floats:
+    """The terms (x / radius)^i (y / radius)^j of a polynomial over the field.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (n,), pixel
+    degree : int
+    radius : float, pixel
+
+    Returns
+    -------
+    ndarray, shape (n, terms)
+
+    Examples
+    --------
+    >>> field_terms([20.0], [-5.0], 1, 10.0).tolist()
+    [[1.0, 2.0, -0.5]]
+    """
+    s, t = np.asarray(x, dtype=float) / radius, np.asarray(y, dtype=float) / radius
+    return np.stack([s**i * t**j for i, j in field_powers(degree)], axis=-1)
+
+
+@serializable("measured_psf")
+@dataclass(frozen=True, eq=False)
+class MeasuredPSF:
+    """An effective PSF, measured on a frame: the light that a pixel receives from a point source.
+
+    The pixel's response is in it, so its model samples it at the pixels' centres
+    (`Detector(pixel="impulse")`). It is a cubic spline in (a, b), the coordinates in which the
+    distortion is taken out, and every coefficient is a polynomial of the source's position:
+
+        p(a, b; x, y) = sum_t (x / r)^i (y / r)^j sum_kl c[t, l, k] B(a h - k) B(b h - l)
+
+    with h samples per pixel and r the field's radius. Its constant term has unit volume, and the
+    others have none, so it changes no flux. Weighted by the Gaussian of the same width its centroid
+    is zero everywhere on the field, so it moves no source: what moves sources is the distortion.
+
+    Parameters
+    ----------
+    coefficients : array_like, shape (terms, n, n), per square pixel
+        The splines' coefficients [t, b, a], n odd; the terms 1, x, y, x^2, x y, y^2, ...
+    oversampling : float
+        Samples per pixel.
+    field_radius : float, pixel
+        Unit of x and y.
+    draws : array_like, shape (k, terms, n, n), per square pixel, optional
+        Coefficients drawn from the posterior of the PSF: its errors.
+    determined : float
+        How many numbers of it the counts determined.
+    model_error : float
+        Standard deviation, as a share of the light, of what this PSF leaves unexplained in the
+        pixels that it was measured on.
+
+    Raises
+    ------
+    InputError
+        If the coefficients are not finite, their number is not that of a polynomial, or the PSF's
+        volume is not positive.
+
+    References
+    ----------
+    J. Anderson & I. King, "Toward high-precision astrometry with WFPC2. I.", PASP 112, 1360 (2000).
+
+    Examples
+    --------
+    >>> x = np.arange(-20, 21) / 4
+    >>> psf = MeasuredPSF(np.exp(-(x**2 + x[:, None] ** 2) / 2)[None], 4.0, 100.0)
+    >>> psf.degree, round(psf.sigma, 1), round(float(psf.density(0.0, 0.0)), 2)
+    (0, 1.0, 0.15)
+    """
+
+    coefficients: Floats
+    oversampling: float
+    field_radius: float
+    draws: Floats | None = field(default=None, kw_only=True)
+    determined: float = field(default=0.0, kw_only=True)
+    model_error: float = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        c = np.array(self.coefficients, dtype=np.float64)
+        n = c.shape[-1] if c.ndim == 3 else 0
+        degree = round((math.sqrt(1.0 + 8.0 * len(c)) - 3.0) / 2.0)
+        shape = (len(field_powers(max(degree, 0))), n, n)
+        if c.shape != shape or n % 2 == 0 or not 5 <= n <= MOST_SAMPLES:
+            raise InputError(
+                f"psf: coefficients: got shape {c.shape}, expected (terms, n, n) with 1, 3, 6, ... "
+                f"terms and n odd, 5 to {MOST_SAMPLES}"
+            )
+        volume = float(c[0].sum())
+        if not (np.isfinite(c).all() and volume > 0.0):
+            raise InputError("psf: coefficients: expected finite ones of a positive sum")
+        if not (1.0 <= self.oversampling <= MOST_SAMPLES and 0.0 < self.field_radius < math.inf):
+            raise InputError(
+                f"psf: got oversampling {self.oversampling} and field_radius {self.field_radius}, "
+                f"expected samples per pixel, 1 to {MOST_SAMPLES}, and a positive radius"
+            )
+        scale = float(self.oversampling) ** 2 / volume
+        draws = None if self.draws is None else np.array(self.draws, dtype=np.float64) * scale
+        if draws is not None and (draws.shape[1:] != c.shape or not np.isfinite(draws).all()):
+            raise InputError(
+                f"psf: draws: got shape {draws.shape}, expected (k, {', '.join(map(str, c.shape))})"
+                " of finite numbers"
+            )
+        object.__setattr__(self, "coefficients", c * scale)
+        object.__setattr__(self, "draws", draws)
+        object.__setattr__(self, "oversampling", float(self.oversampling))
+        object.__setattr__(self, "field_radius", float(self.field_radius))
+        object.__setattr__(self, "determined", float(self.determined))
+        object.__setattr__(self, "model_error", float(self.model_error))
+
+    has_pixel = True  # the pixel's response is part of this PSF
+
+    @property
+    def degree(self) -> int:
+        """Degree of the variation over the field."""
+        return round((math.sqrt(1.0 + 8.0 * len(self.coefficients)) - 3.0) / 2.0)
+
+    @cached_property
+    def peak(self) -> float:
+        """Largest value at a knot, at the field's middle, per square pixel."""
+        return float(_at_knots(self.coefficients[0]).max())
+
+    @cached_property
+    def sigma(self) -> float:
+        """Width of the Gaussian that exceeds half the peak in as large an area, pixel."""
+        bright = np.argwhere(_at_knots(self.coefficients[0]) >= 0.3 * self.peak)
+        side = self.coefficients.shape[-1]
+        low = bright.min(axis=0) - 1.5 - 0.5 * (side - 1)
+        high = bright.max(axis=0) + 1.5 - 0.5 * (side - 1)
+        b, a = np.linspace(low, high, CELLS).T / self.oversampling
+        share = np.mean(self.density(a, b[:, None]) >= 0.5 * self.peak)
+        area = share * np.prod(high - low) / self.oversampling**2
+        return math.sqrt(float(area) / (2.0 * math.pi * math.log(2.0)))
+
+    @property
+    def core(self) -> tuple[float, float]:
+        """See `PSF`."""
+        return self.sigma, 3.0
+
+    @property
+    def profile(self) -> SplineProfile:
+        """The PSF at the field's middle as the compiled loops need it."""
+        scale = self.oversampling * self.sigma
+        spline = np.pad(self.coefficients[0], MARGIN) / self.oversampling**2
+        return SplineProfile(scale**2, spline, scale)
+
+    def profile_of(self, x: Floats, y: Floats) -> SplineProfile | FieldProfile:
+        """The PSF of every source as the compiled loops need it."""
+        one = self.profile
+        if self.degree == 0:
+            return one
+        c = np.tensordot(self.terms(x, y), self.coefficients, 1) / self.oversampling**2
+        edges = [(0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)]
+        return FieldProfile(one.norm, np.pad(c, edges), one.scale)
+
+    def terms(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
+        """The polynomial's terms at positions on the field (pixel), shape (n, terms)."""
+        return field_terms(x, y, self.degree, self.field_radius)
+
+    def support_radius(self, tolerance: float) -> float:
+        """Distance from the middle beyond which p is below `tolerance` times its peak, pixel."""
+        if tolerance == 0.0:
+            return math.inf
+        c = np.abs(self.coefficients).sum(axis=0)
+        four = np.lib.stride_tricks.sliding_window_view(np.pad(c, MARGIN), (4, 4)).max(axis=(2, 3))
+        j, i = np.nonzero(four >= tolerance * self.peak)
+        half = 0.5 * (len(four) - 1)
+        far = np.hypot(np.abs(i - half) + 0.5, np.abs(j - half) + 0.5).max(initial=0.0)
+        return float(far / self.oversampling)
+
+    def density(
+        self, a: npt.ArrayLike, b: npt.ArrayLike, *, at: tuple[float, float] = (0.0, 0.0)
+    ) -> Floats:
+        """The PSF at (a, b), pixel from its middle; per square pixel.
+
+        Parameters
+        ----------
+        a, b : array_like, pixel
+        at : (float, float), pixel
+            The source's position x, y on the field.
+
+        Returns
+        -------
+        ndarray, the broadcast shape
+        """
+        c = np.tensordot(self.terms(*at), self.coefficients, 1)
+        where = np.stack(np.broadcast_arrays(b, a)) * self.oversampling + 0.5 * (len(c) - 1)
+        values = ndimage.map_coordinates(np.pad(c, MARGIN), where.reshape(2, -1) + MARGIN,
+                                         prefilter=False)  # fmt: skip
+        return np.asarray(values.reshape(where.shape[1:]))
+
+    def write(self, path: PathLike, *, overwrite: bool = False) -> None:
+        """Write the PSF with its errors as FITS.
+
+        Parameters
+        ----------
+        path : path-like
+        overwrite : bool
+            Replace a file that exists.
+
+        Raises
+        ------
+        InputError
+            If the file exists or cannot be written.
+        """
+        arrays = {"coefficients": self.coefficients, "draws": self.draws}
+        image = _at_knots(self.coefficients[0])
+        numbers = {
+            "oversampling": self.oversampling, "field_radius": self.field_radius,
+            "determined": self.determined, "model_error": self.model_error,
+        }  # fmt: skip
+        psf_images.write_psf(path, image, arrays, numbers, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path: PathLike) -> Self:
+        """Read a PSF that was written.
+
+        Parameters
+        ----------
+        path : path-like
+
+        Returns
+        -------
+        MeasuredPSF
+
+        Raises
+        ------
+        InputError
+            If it is no such file, or is damaged.
+        """
+        return cls(**psf_images.read_psf(path))
+
+    def to_photutils(self, shape: tuple[int, int] | None = None) -> Any:
+        """The PSF as a model of photutils, whose positions count from a frame's first pixel.
+
+        It is sampled four times a pixel or more. One that varies over the field is sampled on a
+        grid of positions as fine as its degree asks for, between which photutils interpolates.
+
+        Parameters
+        ----------
+        shape : (int, int), optional
+            Of the frame, (ny, nx) pixels; needed of a PSF that varies.
+
+        Returns
+        -------
+        photutils.psf.ImagePSF or photutils.psf.GriddedPSFModel
+
+        Raises
+        ------
+        InputError
+            If photutils is not installed, or the shape is missing.
+        """
+        if self.degree > 0 and shape is None:
+            raise InputError("shape: got none, expected that of the frame: the PSF varies over it")
+        ny, nx = shape or (1, 1)
+        points = 2 * self.degree + 1
+        columns = np.linspace(0.0, nx - 1.0, points) if self.degree else np.zeros(1)
+        rows = np.linspace(0.0, ny - 1.0, points) if self.degree else np.zeros(1)
+        fine = max(4, math.ceil(self.oversampling))
+        half = math.ceil(0.5 * self.coefficients.shape[-1] / self.oversampling * fine)
+        x = np.arange(-half, half + 1) / fine
+        positions = np.array([(u, v) for v in rows for u in columns])
+        images = [
+            self.density(x, x[:, None], at=(u - 0.5 * (nx - 1), v - 0.5 * (ny - 1)))
+            for u, v in positions
+        ]
+        return psf_images.photutils_model(np.array(images), positions, fine)
+
+    def drawn(self) -> "Iterator[MeasuredPSF]":
+        """The PSFs that were drawn from its posterior, each without errors of its own."""
+        for coefficients in self.draws if self.draws is not None else ():
+            yield replace(self, coefficients=coefficients, draws=None)
+
+
+def _at_knots(c: Floats) -> Floats:
+    """The spline's values at its knots."""
+    kernel = np.array([1.0, 4.0, 1.0]) / 6.0
+    once = ndimage.convolve1d(c, kernel, axis=0, mode="constant")
+    return np.asarray(ndimage.convolve1d(once, kernel, axis=1, mode="constant"))
+
+
+@serializable("psf.measured")
+@dataclass(frozen=True)
+class PSFToMeasure(GaussianPSF):
+    """The Gaussian from which a run measures the PSF of its frame.
+
+    Parameters
+    ----------
+    sigma : float, pixel
+        About the right width, which is fitted first.
+    oversampling, degree : int
+        As for `fit_psf`.
+
+    Raises
+    ------
+    InputError
+        If `sigma` is not positive, `oversampling` is not from 1 to 16, or `degree` not from 0 to 6.
+
+    Examples
+    --------
+    >>> PSFToMeasure(1.3, degree=2)
+    PSFToMeasure(sigma=1.3, oversampling=4, degree=2)
+    """
+
+    oversampling: int = 4
+    degree: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choices(self.oversampling, self.degree)
+
+
+@serializable("psf.file")
+@dataclass(frozen=True)
+class PSFFile:
+    """A PSF that was measured on another frame and written to a file.
+
+    Parameters
+    ----------
+    path : str
+        FITS, as `MeasuredPSF.write` and `bayesfred fit` write it.
+
+    Examples
+    --------
+    >>> PSFFile("run.psf.fits")
+    PSFFile(path='run.psf.fits')
+    """
+
+    path: str
+
+
+def check_choices(oversampling: int, degree: int) -> None:
+    """Refuse an oversampling or a degree with which no PSF can be measured.
+
+    Parameters
+    ----------
+    oversampling, degree : int
+
+    Raises
+    ------
+    InputError
+        If they are no integers from 1 to 16, and 0 to 6.
+    """
+    for name, value, low, high in (("oversampling", oversampling, 1, 16), ("degree", degree, 0, 6)):
+        if not isinstance(value, int | np.integer) or not low <= value <= high:
+            raise InputError(
+                f"psf: {name}: got {value!r}, expected an integer from {low} to {high}"
+            )

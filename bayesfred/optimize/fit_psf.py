@@ -1,0 +1,250 @@
+"""The PSF of a frame, from all images of its sources.
+
+The expected counts are linear in the PSF's coefficients c, and nearly so in the other parameters
+over a step of Newton's method. So c, the distortion, the background and the fluxes are solved for
+together, by Fisher scoring of the likelihood and the priors: what a coefficient of the PSF shares
+with the distortion or with a flux is neither's alone, and positions are tied to the distortion's
+polynomial, which breaks the feedback between pixel phase and PSF. Fluxes and shifts of single
+sources, thousands of them, are eliminated.
+
+Two things are the same parameter twice, and conventions tell them apart: the PSF's volume is one
+(fluxes are fluxes), and its centroid within a Gaussian of the start's width is zero (the offset and
+the distortion say where a source is). Both hold for the variation over the field too.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from threadpoolctl import threadpool_limits
+
+from bayesfred._typing import Floats
+from bayesfred.errors import InputError
+from bayesfred.imaging.psf import FWHM, PSF, MeasuredPSF, density_at, has_pixel
+from bayesfred.imaging.psf.measured import check_choices, field_terms
+from bayesfred.imaging.psf.sampled import spline_coefficients
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.psf_equations import WIDTH, PsfEquations, PsfState, field_radius
+from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
+from bayesfred.optimize.psf_samples import PsfSamples
+
+KNOTS_PER_WIDTH = 6.0  # at the least: a spline follows any PSF so to 1e-4 of its peak
+TURNS = 40
+CHOOSING = 8  # turns in which the counts choose the strengths of the prior
+EXACT = 4  # turns in which the model is taken to be exact
+STILL = 0.1  # squared standard deviations, of all unknowns together
+LARGEST = 0.4  # change of the PSF in one turn, share of its peak
+DARKEST = 0.1  # of its value that a flux may fall to in one turn
+DRAWS = 100
+WINGS_SEEN = 5.0  # standard deviations of light beyond the fine grid that call for a wider one
+
+
+def fit_psf(
+    posterior: Posterior, estimate: MapEstimate, *, oversampling: int = 4, degree: int = 0
+) -> MeasuredPSF:
+    """Measure the PSF on all images of a frame's sources.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Its PSF is where the search begins: a Gaussian or a Moffat function of about the right
+        width, samples, or a PSF measured on another frame.
+    estimate : MapEstimate
+        Its maximum.
+    oversampling : int
+        Knots per pixel, of PSFs with a FWHM up to 1.5 pixels; wider ones have as many per FWHM.
+    degree : int
+        Of the polynomial by which the PSF varies over the field; 0 if it does not.
+
+    Returns
+    -------
+    MeasuredPSF
+        With draws from its posterior: its errors, those of the distortion included.
+
+    Raises
+    ------
+    InputError
+        If `oversampling` or `degree` cannot be used, the detector bins pixels, the distortion is no
+        polynomial, too few pixels see a source, or the search does not come to an end.
+
+    References
+    ----------
+    J. Anderson & I. King, PASP 112, 1360 (2000), for the effective PSF. D. MacKay, Neural
+    Computation 4, 415 (1992), for the choice of the prior's strength.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65), pixel="box"), bf.SourceCatalog.grid(4, 14.0, 1e5),
+    ...     bf.GaussianPSF(1.2), bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]))
+    >>> posterior = bf.Posterior(model, bf.simulate(model, [1e-3, 0.0], 5.0, seed=1))
+    >>> psf = bf.fit_psf(posterior, bf.find_map(posterior))
+    >>> abs(psf.sigma - math.hypot(1.2, 12**-0.5)) < 0.01  # the pixel is in it
+    True
+    """
+    check_choices(oversampling, degree)
+    if posterior.model.detector.binning != 1:
+        raise InputError(
+            f"detector: binning: got {posterior.model.detector.binning}, expected 1: a measured "
+            "PSF has one pixel in it; describe the frame in recorded pixels"
+        )
+    with threadpool_limits(1, user_api="blas"):
+        state = starting_state(posterior, estimate, float(oversampling), degree)
+        equations = solved(posterior, state)
+        if _light_beyond(posterior, equations.state) > WINGS_SEEN:
+            equations = solved(posterior, _with_wings(equations.state))
+        return _measured(posterior, equations)
+
+
+def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
+    """The equations where their solution is.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    state : PsfState
+        Where to begin.
+
+    Returns
+    -------
+    PsfEquations
+
+    Raises
+    ------
+    InputError
+        If no solution is found.
+    """
+    for turn in range(TURNS):
+        # a model error that came first would explain what a PSF too smooth leaves
+        equations = PsfEquations.of(posterior, state, exact=turn < EXACT)
+        if turn < CHOOSING:
+            equations = equations.with_strengths()
+        lower, scale = equations.factor
+        far = float(np.sum((lower.T @ (equations.step / scale)) ** 2))
+        if turn > EXACT and far < STILL:
+            return equations
+        state = _moved(posterior, equations)
+    raise InputError(
+        f"psf: no PSF found in {TURNS} turns: expected a start that resembles it: fit the width "
+        "first (nuisances: psf_sigma), or begin from another PSF"
+    )
+
+
+def starting_state(
+    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int
+) -> PsfState:
+    """The posterior's own PSF on the grids, with its pixel.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    estimate : MapEstimate
+    oversampling : float
+    degree : int
+
+    Returns
+    -------
+    PsfState
+    """
+    psf, names = posterior.model.psf, posterior.parameter_names
+    sigma = float(estimate.params[names.index(WIDTH)]) if WIDTH in names else psf.sigma
+    pixel = 0.0 if has_pixel(psf) or posterior.model.detector.pixel == "impulse" else 1.0
+    width = math.hypot(sigma, pixel / math.sqrt(12.0))
+    knots = max(1.0, min(oversampling, oversampling * KNOTS_PER_WIDTH / (4.0 * FWHM * width)))
+    grid = PsfGrid(knots, width, degree, wings=False)
+    side = int(grid.levels.side[0])
+    x = np.linspace(-0.5, 0.5, side) * ((side - 1) / knots)
+    c = spline_coefficients(_pixel_density(psf, psf.sigma / sigma, pixel, x))
+    coefficients = np.zeros(grid.conventions.shape[1])
+    coefficients[: c.size] = c.ravel() * (knots**2 / c.sum())
+    _, _, fluxes, shifts = posterior.likelihood.own_pixels(estimate.params, grid.radius)
+    strengths = np.full(len(grid.blocks), STRENGTH)
+    return PsfState(grid, coefficients, strengths, estimate.params, fluxes, shifts)
+
+
+def _pixel_density(psf: PSF, scale: float, pixel: float, x: Floats) -> Floats:
+    """The PSF narrowed by a factor, integrated over a pixel around the points of a grid."""
+    nodes, weights = leggauss(8) if pixel else (np.zeros(1), np.full(1, 2.0))
+    out = np.zeros((x.size, x.size))
+    for s, w_s in zip(0.5 * pixel * nodes, 0.5 * weights, strict=True):
+        for t, w_t in zip(0.5 * pixel * nodes, 0.5 * weights, strict=True):
+            a, b = scale * (x + s), scale * (x[:, None] + t)
+            out += w_s * w_t * density_at(psf, a, b, (0.0, 0.0)) * scale**2
+    return out
+
+
+def _moved(posterior: Posterior, equations: PsfEquations) -> PsfState:
+    """The state a step on, or as much of the step as leaves the PSF recognisable."""
+    state, step = equations.state, equations.step
+    size = state.deviations.size
+    change = state.grid.combined(np.concatenate([np.zeros(state.grid.fixed), step[:size]]))
+    peak = np.abs(state.grid.combined(state.coefficients)[0]).max()
+    s = posterior.model.sources
+    terms = field_terms(s.x, s.y, state.grid.degree, field_radius(posterior))
+    largest = float(np.abs(terms @ change.reshape(len(change), -1)).max())
+    share = min(1.0, LARGEST * peak / max(largest, 1e-300))
+    index, own, response = equations.eliminated
+    every = share * (own - response @ step)
+    params = state.params + share * step[size:]
+    fluxes, shifts = state.fluxes.copy(), state.shifts.copy()
+    names = posterior.parameter_names
+    if "flux_scale" in names:
+        k = names.index("flux_scale")
+        params[k] = max(params[k], DARKEST * state.params[k])
+        fluxes *= params[k] / state.params[k]
+    light = index % 3 == 0
+    at = index[light] // 3
+    fluxes[at] = np.maximum(fluxes[at] + every[light], DARKEST * fluxes[at])
+    shifts[index[~light] // 3, index[~light] % 3 - 1] += every[~light]
+    coefficients = state.deviating(state.deviations + share * step[:size])
+    return replace(state, coefficients=coefficients, params=params, fluxes=fluxes, shifts=shifts)
+
+
+def _light_beyond(posterior: Posterior, state: PsfState) -> float:
+    """By how many standard deviations light that falls as r^-4 lies beyond the fine grid."""
+    radius = state.grid.radius
+    wide = replace(state.grid, wings=True)
+    data = PsfSamples.at(posterior, state.params, state.shifts, wide.radius)
+    r2 = data.samples.a**2 + data.samples.b**2
+    bright = state.fluxes[data.samples.source]
+    wing = data.image(np.where(r2 > radius**2, bright * (radius**2 / r2) ** 2, 0.0))
+    beyond = data.image(np.asarray(r2 <= radius**2, dtype=np.float64)) == 0.0
+    residual, variance = data.residual(posterior, state.params, np.zeros(len(wing)))
+    weight = np.where(beyond, 1.0 / variance, 0.0)
+    wing = wing - (weight @ wing / weight.sum() if beyond.any() else 0.0)  # of any background
+    spread = float(weight @ wing**2)
+    return float(weight @ (wing * residual)) / math.sqrt(spread) if spread > 0.0 else 0.0
+
+
+def _with_wings(state: PsfState) -> PsfState:
+    """The state with a grid for wings, which are none yet."""
+    grid = replace(state.grid, wings=True)
+    more = grid.conventions.shape[1] - state.coefficients.size
+    return replace(
+        state,
+        grid=grid,
+        coefficients=np.append(state.coefficients, np.zeros(more)),
+        strengths=np.append(state.strengths, STRENGTH),
+    )
+
+
+def _measured(posterior: Posterior, equations: PsfEquations) -> MeasuredPSF:
+    """The PSF at the solution, with draws from its posterior."""
+    state = equations.state
+    size = state.deviations.size
+    there = state.deviations + equations.step[:size]
+    drawn = [
+        state.grid.combined(state.deviating(there + deviation))
+        for deviation in equations.draws(DRAWS)[:size].T
+    ]
+    return MeasuredPSF(
+        state.grid.combined(state.deviating(there)),
+        state.grid.oversampling,
+        field_radius(posterior),
+        draws=np.array(drawn),
+        model_error=equations.model_error,
+        determined=float(equations.determined().sum()),
+    )

@@ -1,0 +1,122 @@
+"""A posterior with a measured PSF: the PSF, the maximum with it, and what its errors take."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from bayesfred._typing import Floats
+from bayesfred.errors import InputError
+from bayesfred.imaging.psf import MeasuredPSF
+from bayesfred.model.information_loss import InformationLoss
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.fit_psf import fit_psf
+from bayesfred.optimize.newton import maximize
+
+
+def measure_psf(
+    posterior: Posterior, estimate: MapEstimate, *, oversampling: int = 4, degree: int = 0
+) -> tuple[Posterior, MapEstimate]:
+    """Measure the PSF of a frame, and maximise the posterior with it.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    estimate : MapEstimate
+        Its maximum.
+    oversampling, degree : int
+        As for `fit_psf`.
+
+    Returns
+    -------
+    posterior : Posterior
+        With the measured PSF, whose errors are in those of the parameters.
+    estimate : MapEstimate
+        Its maximum.
+
+    Raises
+    ------
+    InputError
+        As `fit_psf` and `find_map` do.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65), pixel="box"), bf.SourceCatalog.grid(4, 14.0, 1e5),
+    ...     bf.MoffatPSF(3.0, 4.0), bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]))
+    >>> counts = bf.simulate(model, [1e-3, 0.0], 5.0, seed=1)
+    >>> gaussian = bf.Posterior(bf.ForwardModel(
+    ...     model.detector, model.sources, bf.GaussianPSF(1.3), model.distortion), counts)
+    >>> estimate = bf.find_map(gaussian)
+    >>> posterior, measured = bf.measure_psf(gaussian, estimate)
+    >>> estimate.fits_data, measured.fits_data
+    (False, True)
+    """
+    psf = fit_psf(posterior, estimate, oversampling=oversampling, degree=degree)
+    bare = posterior.with_psf(psf)
+    kept = [posterior.parameter_names.index(name) for name in bare.parameter_names]
+    top = maximize(bare, estimate.params[kept])
+    measured = _marginalized(bare, psf, top.params, psf.determined)
+    return measured, find_map(measured, top.params)
+
+
+def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
+    """Let the errors of a PSF that was measured on another frame widen those of the parameters.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With a `MeasuredPSF`.
+    estimate : MapEstimate
+        Its maximum.
+
+    Returns
+    -------
+    Posterior
+        With a `loss` about that maximum: find it again, for its covariance.
+
+    Raises
+    ------
+    InputError
+        If the PSF was not measured, or has no draws.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65), pixel="box"), bf.SourceCatalog.grid(4, 14.0, 1e5),
+    ...     bf.GaussianPSF(1.3), bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]))
+    >>> first, second = (bf.Posterior(model, bf.simulate(model, [1e-3, 0.0], 5.0, seed=seed))
+    ...                  for seed in (1, 2))
+    >>> other = second.with_psf(bf.fit_psf(first, bf.find_map(first)))
+    >>> known = bf.find_map(other)
+    >>> widened = bf.find_map(bf.marginalize_psf(other, known))
+    >>> bool(np.all(np.diag(widened.covariance) > np.diag(known.covariance)))
+    True
+    """
+    psf = posterior.model.psf
+    if not isinstance(psf, MeasuredPSF) or psf.draws is None:
+        raise InputError(
+            f"psf: got {type(psf).__name__} without draws, expected a MeasuredPSF with its errors: "
+            "fit_psf makes one"
+        )
+    return _marginalized(replace(posterior, loss=None), psf, estimate.params, 0.0)
+
+
+def _marginalized(
+    posterior: Posterior, psf: MeasuredPSF, centre: Floats, absorbed: float
+) -> Posterior:
+    likelihood, model = posterior.likelihood, posterior.model
+    slopes = np.array(
+        [
+            replace(likelihood, model=replace(model, psf=drawn)).gradient(centre)
+            for drawn in psf.drawn()
+        ]
+    )
+    slopes = slopes[np.isfinite(slopes).all(axis=1)]
+    information = posterior.information(centre)
+    names = posterior.parameter_names
+    loss = InformationLoss.of(names, centre, information, slopes, absorbed)
+    return replace(posterior, loss=loss)

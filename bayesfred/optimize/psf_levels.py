@@ -1,0 +1,182 @@
+"""The unknown part of a PSF: grids of B-splines, what is thought of them before, and their sum.
+
+The start's spline c0 is kept, and deviations from it are looked for on two grids: a fine one for
+the PSF at the field's middle, and one twice as coarse, whose splines are exact sums of finer ones,
+for its variation over the field. A third one, four times as coarse and three times as wide, is for
+wings that the fine one cannot hold.
+
+Before the counts speak, a block of deviations (a grid and a term of the field) is a smooth function
+within an envelope E(r), which falls off as a PSF's wings do, or a pedestal under every star could
+not be told from the background: with z = c / E its log-density is
+
+    -strength / 2 (sum of squared second differences of z) - AMPLITUDE / 2 (sum of z^2)
+
+and the counts choose the strength: the evidence is largest where strength z^T Q z is the number of
+differences that the counts determine (D. MacKay, "Bayesian interpolation", Neural Computation 4
+(1992), Eq. 4.11).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from bayesfred._typing import Floats
+from bayesfred.imaging.psf.measured import field_powers
+from bayesfred.model.kernels.psf_normal import Levels
+
+RADIUS = 7.0  # of the fine grid, widths of the PSF
+FIELD_RADIUS = 5.0  # of the grid for the variation over the field
+WINGS = 21.0  # of the grid for wings
+AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
+STRENGTH = 100.0  # to begin with
+LIMITS = (1e-3, 1e9)  # of a strength
+
+
+class PsfBlock(NamedTuple):
+    """A block of deviations: where it is among all, and the two parts of its prior's precision."""
+
+    where: slice
+    roughness: sparse.csr_array  # to be multiplied by the strength
+    amplitude: Floats  # a diagonal
+
+
+@dataclass(frozen=True, eq=False)
+class PsfGrid:
+    """The grids of deviations from a start.
+
+    Attributes
+    ----------
+    oversampling : float
+        Fine knots per pixel.
+    sigma : float, pixel
+        Width of the start.
+    degree : int
+        Of the variation over the field.
+    wings : bool
+        Whether there is a grid for wings.
+    """
+
+    oversampling: float
+    sigma: float
+    degree: int
+    wings: bool
+
+    @property
+    def radius(self) -> float:
+        """Distance from the middle that the grids cover, pixel."""
+        return (WINGS if self.wings else RADIUS) * self.sigma
+
+    @cached_property
+    def levels(self) -> Levels:
+        """The grids as the compiled loops need them: start, fine, then coarser ones."""
+        terms = len(field_powers(self.degree))
+        rows = [(1, RADIUS * self.sigma, 0, 1), (1, RADIUS * self.sigma, 0, 1)]
+        if terms > 1:
+            rows.append((2, FIELD_RADIUS * self.sigma, 1, terms))
+        if self.wings:
+            rows.append((4, self.radius, 0, 1))
+        h = np.array([times / self.oversampling for times, *_ in rows])
+        side = np.array(
+            [2 * round(radius / step) + 1 for step, (_, radius, *_) in zip(h, rows, strict=True)]
+        )
+        low, high = np.array([row[2:] for row in rows]).T
+        start = np.concatenate([[0], np.cumsum(side**2 * (high - low))])[:-1]
+        return Levels(start, side, low, high, h)
+
+    @property
+    def fixed(self) -> int:
+        """How many coefficients come first that are the start's and are not solved for."""
+        return int(self.levels.start[1])
+
+    @cached_property
+    def unknown(self) -> Levels:
+        """The grids of deviations alone, numbered from 0."""
+        every = self.levels
+        return Levels(
+            every.start[1:] - self.fixed, every.side[1:], every.low[1:], every.high[1:],
+            every.spacing[1:],
+        )  # fmt: skip
+
+    @cached_property
+    def blocks(self) -> list[PsfBlock]:
+        """The blocks of deviations."""
+        out = []
+        levels = self.unknown
+        for k, side in enumerate(levels.side):
+            terms, envelope = int(levels.high[k] - levels.low[k]), self.envelope(k)
+            roughness, amplitude = _roughness(envelope, int(side)), AMPLITUDE / envelope**2
+            for t in range(terms):
+                begin = int(levels.start[k]) + t
+                where = slice(begin, begin + terms * int(side) ** 2, terms)
+                out.append(PsfBlock(where, roughness, amplitude))
+        return out
+
+    def envelope(self, k: int) -> Floats:
+        """E at the knots of a grid of deviations, per square pixel: the wings of a Moffat PSF."""
+        n, h = int(self.unknown.side[k]), float(self.unknown.spacing[k])
+        x = (np.arange(n) - 0.5 * (n - 1)) * h / (2.0 * self.sigma)
+        peak = 1.0 / (2.0 * np.pi * self.sigma**2)
+        return np.asarray(peak * (1.0 + x**2 + x[:, None] ** 2) ** -2.0).ravel()
+
+    @cached_property
+    def conventions(self) -> Floats:
+        """Volume and centroid of every term of the field, shape (3 terms, coefficients).
+
+        The centroid is that within a Gaussian of the start's width.
+        """
+        levels = self.levels
+        last = levels.side.size - 1
+        size = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
+        out = np.zeros((3 * len(field_powers(self.degree)), int(size)))
+        for k, side in enumerate(levels.side):
+            h, n = float(levels.spacing[k]), int(side)
+            x = (np.arange(n) - 0.5 * (n - 1)) * h
+            weight = np.exp(-0.5 * (x**2 + x[:, None] ** 2) / self.sigma**2)
+            rows = np.stack([np.ones((n, n)), x * weight, x[:, None] * weight])
+            terms = int(levels.high[k] - levels.low[k])
+            for t in range(terms):
+                begin, term = int(levels.start[k]) + t, int(levels.low[k]) + t
+                every = slice(begin, begin + terms * n * n, terms)
+                out[3 * term : 3 * term + 3, every] = rows.reshape(3, -1) * h**2
+        return out
+
+    def combined(self, coefficients: Floats) -> Floats:
+        """All grids' coefficients as those of one fine grid, shape (terms, n, n)."""
+        levels, parts = self.levels, []
+        for k, side in enumerate(levels.side):
+            terms = int(levels.high[k] - levels.low[k])
+            begin = int(levels.start[k])
+            part = coefficients[begin : begin + terms * side**2].reshape(side, side, terms)
+            part = np.moveaxis(part, 2, 0)
+            for _ in range(round(levels.spacing[k] * self.oversampling).bit_length() - 1):
+                part = _halved(part)
+            parts.append((int(levels.low[k]), part))
+        n = max(part.shape[1] for _, part in parts)
+        out = np.zeros((len(field_powers(self.degree)), n, n))
+        for low, part in parts:
+            edge = (n - part.shape[1]) // 2
+            out[low : low + len(part), edge : n - edge, edge : n - edge] += part
+        return out
+
+
+def _roughness(envelope: Floats, n: int) -> sparse.csr_array:
+    """The sum of squared second differences of c / E as a matrix; zeros surround the grid."""
+    inverse, one, first = sparse.diags_array(1.0 / envelope), sparse.eye_array(n), np.ones(n)
+    second = sparse.diags_array([first[1:], -2.0 * first, first[1:]], offsets=[-1, 0, 1])
+    ends = sparse.csr_array(([1.0, 1.0], ([0, 1], [0, n - 1])), (2, n))
+    second = sparse.vstack([second, ends])
+    slope = sparse.diags_array([-first, first[1:]], offsets=[0, 1])
+    xx, yy, xy = sparse.kron(one, second), sparse.kron(second, one), sparse.kron(slope, slope)
+    return sparse.csr_array(inverse @ (xx.T @ xx + yy.T @ yy + 2.0 * xy.T @ xy) @ inverse)
+
+
+def _halved(c: Floats) -> Floats:
+    """The same cubic splines on knots half as far apart, shape (terms, 2 n + 3, 2 n + 3)."""
+    n = c.shape[1]
+    mask = np.zeros((2 * n + 3, n))
+    for k, share in enumerate((1.0, 4.0, 6.0, 4.0, 1.0)):
+        mask[2 * np.arange(n) + k, np.arange(n)] = share / 8.0
+    return np.asarray(mask @ c @ mask.T)

@@ -1,0 +1,329 @@
+"""The PSF that is measured on a frame, against known ones."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import bayesfred as bf
+from bayesfred.model.information_loss import InformationLoss
+from bayesfred.model.kernels.psf_normal import SourceSamples, normal_equations, sample_psf
+from bayesfred.optimize.fit_psf import solved, starting_state
+from bayesfred.optimize.psf_levels import PsfGrid
+
+LINEAR = bf.PolynomialDistortion.polynomial(1)
+
+
+def cubic(x):
+    """The cubic B-spline, by its definition as a truncated power."""
+    powers = [np.maximum(x + 2.0 - k, 0.0) ** 3 for k in range(5)]
+    return sum(c * p for c, p in zip((1, -4, 6, -4, 1), powers, strict=True)) / 6.0
+
+
+def dense_design(levels, field, samples):
+    """p of every sample as a linear function of the coefficients, by loops."""
+    last = len(levels.side) - 1
+    size = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
+    out = np.zeros((len(samples.a), size))
+    for n, (s, a, b) in enumerate(zip(samples.source, samples.a, samples.b, strict=True)):
+        for k, side in enumerate(levels.side):
+            terms, h = levels.high[k] - levels.low[k], levels.spacing[k]
+            for j in range(side):
+                for i in range(side):
+                    middle = 0.5 * (side - 1)
+                    value = cubic(a / h + middle - i) * cubic(b / h + middle - j)
+                    at = levels.start[k] + (j * side + i) * terms
+                    out[n, at : at + terms] = value * field[s, levels.low[k] : levels.high[k]]
+    return out
+
+
+def crowded(rng, n_pixels=40, n_sources=3):
+    """Samples of sources that share pixels, some beyond the grids."""
+    first = np.concatenate([[0], np.cumsum(rng.integers(1, n_sources + 1, n_pixels))])
+    size = first[-1]
+    source = rng.integers(0, n_sources, size)
+    a, b = rng.uniform(-6.0, 6.0, (2, size))
+    return SourceSamples(first, source, a, b, rng.uniform(0.9, 1.1, size))
+
+
+def test_normal_equations_agree_with_a_dense_design_matrix():
+    rng = np.random.default_rng(1)
+    grid = PsfGrid(1.3, 0.8, 1, wings=True)
+    samples = crowded(rng)
+    field = np.column_stack([np.ones(3), rng.normal(size=(3, 2))])
+    levels, n = grid.unknown, len(samples.first) - 1
+    design = dense_design(levels, field, samples)
+    flux, weight = rng.uniform(1.0, 2.0, 3), rng.uniform(0.0, 1.0, n)
+    residual, background = rng.normal(size=n), rng.normal(size=(n, 2))
+    templates = rng.normal(size=(3, len(samples.a)))
+    owner = np.repeat(np.arange(n), np.diff(samples.first))
+    rows = np.zeros((n, design.shape[1]))
+    np.add.at(rows, owner, design * (flux[samples.source] * samples.size)[:, None])
+    light = np.zeros((n, 9))
+    for m in range(3):
+        np.add.at(light, (owner, 3 * samples.source + m), templates[m])
+    pixels = flux, weight, residual, background
+    half, coupling, others = normal_equations(levels, field, samples, pixels, templates)
+    weighed = rows.T * weight
+    np.testing.assert_allclose(half + half.T, weighed @ rows, atol=1e-11)
+    np.testing.assert_allclose(coupling.T, weighed @ light, atol=1e-11)
+    np.testing.assert_allclose(others[:, :2], weighed @ background, atol=1e-11)
+    np.testing.assert_allclose(others[:, 2], weighed @ residual, atol=1e-11)
+    coefficients = rng.normal(size=design.shape[1])
+    p, p_a, p_b = sample_psf(levels, field, samples, coefficients)
+    np.testing.assert_allclose(p, design @ coefficients, atol=1e-11)
+    step = 1e-6
+    for slope, key in ((p_a, "a"), (p_b, "b")):
+        moved = [
+            sample_psf(levels, field, samples._replace(**{key: getattr(samples, key) + h}),
+                       coefficients)[0]
+            for h in (step, -step)
+        ]  # fmt: skip
+        np.testing.assert_allclose(slope, (moved[0] - moved[1]) / (2 * step), atol=1e-8)
+
+
+def test_the_grids_together_are_one_fine_grid():
+    rng = np.random.default_rng(2)
+    grid = PsfGrid(4.0, 0.7, 2, wings=True)
+    c = rng.normal(size=grid.conventions.shape[1])
+    psf = grid.combined(c)
+    n = psf.shape[-1]
+    x = np.arange(n) - 0.5 * (n - 1)
+    a, b = rng.uniform(-4.0, 4.0, (2, 30))
+    field = np.column_stack([np.ones(2), rng.normal(size=(2, 5))])
+    source = rng.integers(0, 2, 30)
+    samples = SourceSamples(np.arange(31), source, a, b, np.ones(30))
+    one = np.einsum("st,tji->sji", field, psf)[source]
+    expected = np.einsum(
+        "sji,sj,si->s", one, cubic(b[:, None] * 4.0 - x), cubic(a[:, None] * 4.0 - x)
+    )
+    np.testing.assert_allclose(sample_psf(grid.levels, field, samples, c)[0], expected, atol=1e-12)
+
+
+def frame_of(psf, fwhm, *, side=6, seed=1, pixel="box"):
+    """A frame of stars at random places near a grid, and a posterior with a Gaussian PSF."""
+    rng = np.random.default_rng(seed)
+    spacing = max(6.0 * fwhm, 10.0)
+    grid = bf.SourceCatalog.grid(side, spacing, 1e5)
+    jitter = rng.uniform(-0.5, 0.5, (2, len(grid)))
+    sources = bf.SourceCatalog(grid.x + jitter[0], grid.y + jitter[1], grid.flux)
+    size = int(spacing * (side + 1)) | 1
+    d = bf.PolynomialDistortion.polynomial(1)
+    model = bf.ForwardModel(bf.Detector((size, size), pixel=pixel), sources, psf, d)
+    theta = 1e-3 * rng.normal(size=d.n_terms) * (np.arange(d.n_terms) < 2)
+    counts = bf.simulate(model, theta, 5.0, seed=seed)
+    start = replace(model, psf=bf.GaussianPSF(fwhm / 2.3548))
+    nuisances = bf.Nuisances(flux="free", offset=True, psf_sigma=True)
+    return model, theta, bf.Posterior(start, counts, nuisances=nuisances)
+
+
+def in_pixels(psf, a, b):
+    """A PSF integrated over pixels, on a grid of points, by the midpoint rule."""
+    offsets = (np.arange(25) - 12.0) / 25.0
+    u, v = np.asarray(a)[..., None, None] + offsets, np.asarray(b)[..., None, None]
+    return psf.density(u, v + offsets[:, None]).mean(axis=(-1, -2))
+
+
+def z_of(measured, true, a, b, **at):
+    """The error of a measured PSF at some points in units of its own."""
+    drawn = np.array([draw.density(a, b, **at) for draw in measured.drawn()])
+    return (measured.density(a, b, **at) - true) / drawn.std(axis=0)
+
+
+def donut():
+    """A pupil's image, blurred: a ring of 4 pixels across."""
+    x = np.arange(-60, 61) / 6.0
+    r = np.hypot(x, x[:, None])
+    return bf.SampledPSF(np.exp(-0.5 * ((r - 2.0) / 0.8) ** 2), 6.0)
+
+
+@pytest.mark.parametrize(
+    ("psf", "fwhm"),
+    [(bf.GaussianPSF(0.5), 1.18), (bf.MoffatPSF(3.0, 4.765), 3.0), (donut(), 5.0)],
+    ids=["undersampled Gaussian", "Moffat", "donut"],
+)
+def test_a_known_psf_is_recovered_to_its_errors(psf, fwhm):
+    _, _, posterior = frame_of(psf, fwhm)
+    measured = bf.fit_psf(posterior, bf.find_map(posterior))
+    assert measured.model_error == 0.0
+    x = np.linspace(-fwhm, fwhm, 13)
+    true = in_pixels(psf, x + 0.0 * x[:, None], x[:, None] + 0.0 * x)
+    z = z_of(measured, true, x, x[:, None])
+    # some tens of independent numbers: the rms scatters by about 0.15
+    assert 0.3 < np.sqrt(np.mean(z**2)) < 1.5
+    assert np.abs(measured.density(x, x[:, None]) - true).max() < 0.02 * true.max()
+
+
+def comatic():
+    """A Gaussian with the pixel in it, and coma that grows outward but moves no centroid."""
+    x = np.arange(-24, 25) / 4.0
+    a, b = x + 0.0 * x[:, None], x[:, None] + 0.0 * x
+    sigma = 1.2
+    core = np.exp(-0.5 * (a**2 + b**2) / sigma**2)
+    coma = 0.2 * core * ((a**2 + b**2) / sigma**2 - 2.0) * np.stack([a, b]) / sigma
+    return bf.MeasuredPSF(np.stack([core, *coma]), 4.0, 60.0)
+
+
+def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
+    true = comatic()
+    _, _, posterior = frame_of(true, 2.8, pixel="impulse")
+    estimate = bf.find_map(posterior)
+    constant, varying = (bf.fit_psf(posterior, estimate, degree=k) for k in (0, 1))
+    assert constant.model_error > 0.02 and varying.model_error < 0.005
+    x = np.linspace(-3.0, 3.0, 13)
+    for at in ((-40.0, 30.0), (35.0, 35.0)):
+        z = z_of(varying, true.density(x, x[:, None], at=at), x, x[:, None], at=at)
+        assert np.sqrt(np.mean(z**2)) < 1.5
+
+
+def test_errors_of_the_psf_are_those_of_a_joint_fit():
+    """The loss comes from gradients at drawn PSFs, the joint fit from one matrix."""
+    _, _, posterior = frame_of(bf.MoffatPSF(1.2, 4.765), 1.2, side=4)
+    estimate = bf.find_map(posterior)
+    measured, known = bf.measure_psf(posterior, estimate)
+    equations = solved(posterior, starting_state(posterior, estimate, 4.0, 0))
+    size = equations.state.deviations.size
+    kept = [size + k for k, name in enumerate(posterior.parameter_names)
+            if name in measured.parameter_names and name != "background"]  # fmt: skip
+    joint = equations.draws(20_000)[kept].std(axis=1)
+    own = [k for k, name in enumerate(measured.parameter_names) if name != "background"]
+    marginal = np.sqrt(np.diag(known.covariance))[own]
+    conditional = np.linalg.inv(replace(measured, loss=None).information(known.params))
+    widening = marginal / np.sqrt(np.diag(conditional))[own]
+    # 100 draws know what is added to a variance to 14 %
+    np.testing.assert_allclose(marginal, joint, rtol=0.1)
+    assert np.all(widening > 1.02) and widening.max() > 1.2
+
+
+def test_conventions_of_volume_and_centroid():
+    _, _, posterior = frame_of(bf.MoffatPSF(3.0, 4.765), 3.0, side=5)
+    estimate = bf.find_map(posterior)
+    psf = bf.fit_psf(posterior, estimate, degree=1)
+    n, h = psf.coefficients.shape[-1], 1.0 / psf.oversampling
+    x = (np.arange(n) - 0.5 * (n - 1)) * h
+    np.testing.assert_allclose(psf.coefficients.sum(axis=(1, 2)) * h * h, [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(psf.draws.sum(axis=(2, 3)) * h * h, 100 * [[1, 0, 0]], atol=1e-9)
+    sigma = math.hypot(estimate.params[posterior.parameter_names.index("psf_sigma")], 12**-0.5)
+    window = np.exp(-0.5 * (x**2 + x[:, None] ** 2) / sigma**2)
+    for axis in (x, x[:, None]):
+        # the convention is a sum over the coarse grid of the variation, and this over the fine one
+        centroids = (psf.coefficients * window * axis).sum(axis=(1, 2)) * h * h
+        np.testing.assert_allclose(centroids, 0.0, atol=1e-3)
+
+
+def test_information_loss_is_that_of_a_joint_fit():
+    """Against Schur's complement, of a posterior that is normal in parameters and PSF."""
+    rng = np.random.default_rng(3)
+    half = rng.normal(size=(7, 9))
+    joint = half @ half.T
+    i, k, c = joint[:3, :3], joint[:3, 3:], joint[3:, 3:]
+    marginal = np.linalg.inv(c - k.T @ np.linalg.inv(i) @ k)
+    draws = rng.multivariate_normal(np.zeros(4), marginal, 20_000)
+    loss = InformationLoss.of(("a", "b", "c"), np.zeros(3), i, draws @ k.T)
+    schur = i - k @ np.linalg.inv(c) @ k.T
+    np.testing.assert_allclose(loss.remaining, schur, atol=0.05 * np.abs(schur).max())
+    np.testing.assert_allclose(loss.left_of(i), loss.remaining, rtol=1e-9)
+    for scale in (0.1, 300.0):
+        at, step = scale * np.array([1.0, -2.0, 0.5]), 1e-5 * scale
+        slope = [
+            (loss.log_factor((at + e)[None]) - loss.log_factor((at - e)[None]))[0] / (2 * step)
+            for e in step * np.eye(3)
+        ]
+        np.testing.assert_allclose(loss.gradient(at), slope, rtol=1e-5, atol=1e-9)
+    far = np.outer(np.geomspace(1.0, 1e6, 50), [1.0, 1.0, 1.0])
+    value = loss.log_factor(far) - 0.5 * np.einsum("ni,ij,nj->n", far, i, far)
+    assert np.all(np.diff(value) < 0.0)  # it stays a density
+
+
+def varying_model(rng):
+    c = rng.normal(size=(3, 13, 13)) * 0.01
+    x = np.arange(-6, 7) / 3.0
+    c[0] += np.exp(-0.5 * (x**2 + x[:, None] ** 2))
+    psf = bf.MeasuredPSF(c, 3.0, 20.0)
+    sources = bf.SourceCatalog([-8.0, 5.2, 9.1], [3.3, -6.7, 4.0], [1e3, 2e3, 3e3])
+    d = bf.PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 0)])
+    return bf.ForwardModel(bf.Detector((31, 33)), sources, psf, d, tolerance=0.0), [1e-3, -2e-3]
+
+
+def test_a_psf_that_varies_over_the_field_is_rendered_as_its_definition_says():
+    model, theta = varying_model(np.random.default_rng(4))
+    d, s, psf = model.distortion, model.sources, model.psf
+    u, v = model.detector.pixel_centres()
+    u, v = np.broadcast_arrays(u, v[:, None])
+    expected = np.zeros(model.detector.shape)
+    x = np.arange(13) - 6.0
+    for star in zip(s.x, s.y, s.flux, strict=True):
+        c = np.tensordot([1.0, star[0] / 20.0, star[1] / 20.0], psf.coefficients, 1)
+        f, g = d.displacement(theta, u, v, *star[:2])
+        a, b = 3.0 * (u - star[0] + f), 3.0 * (v - star[1] + g)
+        p = np.einsum("ji,vuj,vui->vu", c, cubic(b[..., None] - x), cubic(a[..., None] - x))
+        expected += star[2] * p * np.abs(d.determinant(theta, u, v, *star[:2]))
+    np.testing.assert_allclose(model.expected_counts(theta), expected, atol=1e-10)
+    steps = np.diag([1e-6, 1e-6])
+    slopes = [
+        (model.expected_counts(theta + e) - model.expected_counts(theta - e)) / 2e-6 for e in steps
+    ]
+    np.testing.assert_allclose(model.jacobian(theta), slopes, atol=1e-4 * np.abs(slopes).max())
+
+
+def test_gradient_and_information_with_a_psf_that_varies():
+    model, theta = varying_model(np.random.default_rng(4))
+    counts = bf.simulate(model, theta, 20.0, seed=1)
+    posterior = bf.Posterior(model, counts, nuisances=bf.Nuisances(flux="free", offset=True))
+    at = np.array([*theta, 20.0, 0.01, -0.02])[
+        [["f_ux", "g_y", "background", "offset_x", "offset_y"].index(n)
+         for n in posterior.parameter_names]]  # fmt: skip
+    errors = np.diag(np.linalg.inv(posterior.information(at))) ** 0.5
+    slopes = [
+        (posterior.log_prob(at + e) - posterior.log_prob(at - e)) / (2e-4 * s)
+        for e, s in zip(1e-4 * np.diag(errors), errors, strict=True)
+    ]
+    np.testing.assert_allclose(posterior.gradient(at) * errors, slopes * errors, atol=1e-5)
+
+
+def test_bad_psfs_are_refused_in_one_line():
+    good = np.ones((1, 5, 5))
+    for coefficients, oversampling, radius in (
+        (np.ones((2, 5, 5)), 2.0, 1.0), (np.ones((1, 4, 4)), 2.0, 1.0), (np.nan * good, 2.0, 1.0),
+        (-good, 2.0, 1.0), (good, 0.5, 1.0), (good, 2.0, 0.0),
+    ):  # fmt: skip
+        with pytest.raises(bf.InputError, match="psf: "):
+            bf.MeasuredPSF(coefficients, oversampling, radius)
+    psf = bf.MeasuredPSF(good, 2.0, 1.0)
+    sources = bf.SourceCatalog([0.0], [0.0], [1e3])
+    with pytest.raises(bf.InputError, match="has the pixel's response in it"):
+        bf.ForwardModel(bf.Detector((9, 9), pixel="box"), sources, psf, LINEAR)
+
+
+def fitted_errors(fwhm, frames):
+    """Errors over claimed errors of frames fitted with their PSF measured, and with a Gaussian."""
+    measured, gaussian = [], []
+    for seed in range(frames):
+        model, theta, posterior = frame_of(bf.MoffatPSF(fwhm, 4.765), fwhm, seed=seed)
+        truth = dict(zip(model.distortion.names, theta, strict=True))
+        estimate = bf.find_map(posterior)
+        for kept, known, out in (
+            (posterior, estimate, gaussian),
+            (*bf.measure_psf(posterior, estimate), measured),
+        ):
+            errors = np.sqrt(np.diag(known.covariance))
+            rows = zip(kept.parameter_names, known.params, errors, strict=True)
+            names = (*truth, "offset_x", "offset_y")
+            out.append([(value - truth.get(n, 0.0)) / e for n, value, e in rows if n in names])
+    return np.abs(measured), np.abs(gaussian)
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize("fwhm", [1.2, 3.0])
+def test_coverage_with_a_psf_that_was_measured(fwhm):
+    """Of 200 frames with 36 stars: 1,200 z-scores know 68 % to 1.3 %, and 95 % to 0.6 %.
+
+    The errors of a Gaussian of the best width are the control; it is too easily right of stars
+    that are well sampled.
+    """
+    measured, gaussian = fitted_errors(fwhm, 200)
+    assert abs(np.mean(measured < 1.0) - 0.683) < 0.05
+    assert abs(np.mean(measured < 1.96) - 0.95) < 0.03
+    if fwhm < 2.0:
+        assert np.mean(gaussian < 1.0) < 0.6 and np.mean(gaussian < 1.96) < 0.88
