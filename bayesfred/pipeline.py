@@ -153,7 +153,7 @@ def read_frame(
             for line in choice.lines():
                 note(line)
         if has_pixel(posterior.model.psf) or isinstance(psf, PSFToMeasure):
-            with searching() if say else nullcontext():
+            with searching("measuring the PSF") if say else nullcontext():
                 posterior, estimate = _with_measured_psf(posterior, estimate, psf)
             note(_described_psf(posterior))
     return posterior, estimate, notes

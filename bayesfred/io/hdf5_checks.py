@@ -22,7 +22,7 @@ from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
 SCHEMA = 6
-READABLE = (3, 4, 5)  # not all that it may hold; see `sampling/chainfile`
+READABLE = (3, 4, 5, 6)  # not all that it may hold; see `sampling/chainfile`
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 

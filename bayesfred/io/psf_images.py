@@ -98,7 +98,8 @@ def read_psf(path: PathLike) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", AstropyWarning)
-            with fits.open(path, checksum=True, memmap=False) as file:
+            # of a file that is damaged astropy would leave the handle open
+            with fits.open(io.BytesIO(path.read_bytes()), checksum=True) as file:
                 header = file[0].header
                 found: dict[str, Any] = {name: float(header[key]) for name, (key, _) in
                                          _KEYS.items()}  # fmt: skip

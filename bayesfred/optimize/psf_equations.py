@@ -101,9 +101,10 @@ class PsfEquations:
         grid, params, fluxes = state.grid, state.params, state.fluxes
         sources = posterior.model.sources
         data = PsfSamples.at(posterior, params, state.shifts, grid.radius)
-        if data.pixel.size <= len(params) + 10:
+        seen = int(np.sum(np.diff(data.samples.first) > 0))
+        if seen <= len(params) + 10:
             raise InputError(
-                f"psf: got {data.pixel.size} pixels that see a source, expected more: widen the "
+                f"psf: got {seen} pixels that see a source, expected more: widen the "
                 "footprint or the mask"
             )
         terms = field_terms(sources.x, sources.y, grid.degree, field_radius(posterior))

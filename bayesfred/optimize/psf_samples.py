@@ -23,7 +23,8 @@ class PsfSamples:
     samples : SourceSamples
         For the compiled loops.
     pixel : ndarray, shape (pixels,)
-        The pixels' numbers, row nx + column.
+        The pixels' numbers, row nx + column: those with samples, then those without, which know
+        the background.
     owner : ndarray, shape (samples,)
         Which of these pixels a sample lies in.
     counts : ndarray, shape (pixels,), counts
@@ -87,6 +88,11 @@ class PsfSamples:
         if model.conserve_flux:
             size = np.abs(d.determinant(theta, u[near], v[near], x[near], y[near]))
         first = np.append(first, near.size)
+        dark = posterior.mask.ravel().copy()
+        dark[numbers] = False
+        beyond = np.flatnonzero(dark)
+        numbers = np.append(numbers, beyond)
+        first = np.append(first, np.full(beyond.size, first[-1]))
         samples = SourceSamples(first, source[near], a[near], b[near], size)
         owner = np.repeat(np.arange(numbers.size), np.diff(first))
         free = [p.slot for p in posterior.parameters if p.kind == "background"]

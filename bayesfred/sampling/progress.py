@@ -17,14 +17,12 @@ __all__ = ["progress_bar", "searching"]
 INTERVAL = 30.0  # seconds between lines
 
 
-def searching() -> AbstractContextManager[Any]:
-    """Says in a terminal, within its `with` block, that the maximum is being searched for."""
+def searching(what: str = "searching for the maximum") -> AbstractContextManager[Any]:
+    """Says in a terminal, within its `with` block, what is being done."""
     console = _standard_error()
     if not _live(console):
         return nullcontext()
-    return console.status(
-        "searching for the maximum (the first run on a machine compiles: half a minute)"
-    )
+    return console.status(f"{what} (the first run on a machine compiles: half a minute)")
 
 
 @contextmanager
