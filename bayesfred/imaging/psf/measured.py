@@ -17,6 +17,7 @@ from bayesfred.imaging.psf.sampled import MARGIN, MOST_SAMPLES, FieldProfile, Sp
 from bayesfred.io import psf_images
 from bayesfred.io.serialize import serializable
 
+NORMALISED = 1e-9
 CELLS = 201  # a side, by which the area above half the peak is counted
 
 
@@ -136,6 +137,8 @@ class MeasuredPSF:
                 f"expected samples per pixel, 1 to {MOST_SAMPLES}, and a positive radius"
             )
         scale = float(self.oversampling) ** 2 / volume
+        if abs(scale - 1.0) < NORMALISED:  # so that what was stored is read as it was
+            scale = 1.0
         draws = None if self.draws is None else np.array(self.draws, dtype=np.float64) * scale
         if draws is not None and (draws.shape[1:] != c.shape or not np.isfinite(draws).all()):
             raise InputError(
