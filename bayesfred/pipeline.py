@@ -19,13 +19,13 @@ from bayesfred.analysis.field import displacement_field
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.sbc import SBCResult
 from bayesfred.errors import InputError, printable
-from bayesfred.imaging.psf import FWHM, PSF, MeasuredPSF, PSFToMeasure, has_pixel
+from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
-from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf
+from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.records import Result, Study
 from bayesfred.reporting.figures import page_figures
@@ -155,7 +155,7 @@ def read_frame(
         if has_pixel(posterior.model.psf) or isinstance(psf, PSFToMeasure):
             with searching("measuring the PSF") if say else nullcontext():
                 posterior, estimate = _with_measured_psf(posterior, estimate, psf)
-            note(_described_psf(posterior))
+            note(psf_message(posterior))
     return posterior, estimate, notes
 
 
@@ -185,19 +185,6 @@ def _with_measured_psf(
         return measure_psf(posterior, estimate, oversampling=psf.oversampling, degree=psf.degree)
     posterior = marginalize_psf(posterior, estimate)
     return posterior, find_map(posterior, estimate.params)
-
-
-def _described_psf(posterior: Posterior) -> str:
-    """What was found of a measured PSF."""
-    psf = posterior.model.psf
-    assert isinstance(psf, MeasuredPSF), "one was measured"
-    here = "" if posterior.loss is None or posterior.loss.absorbed else " on another frame"
-    varies = f", varying with degree {psf.degree} over the field" if psf.degree else ""
-    left = f"{psf.model_error:.1%} of the light unexplained"
-    return (
-        f"psf: measured{here}, FWHM {FWHM * psf.sigma:.2f} pixel with the pixel in it{varies}, "
-        f"{psf.determined:.0f} numbers determined, {left if psf.model_error else 'noise is left'}"
-    )
 
 
 def _census(posterior: Posterior, kept: Posterior) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.psf import MeasuredPSF
+from bayesfred.imaging.psf import FWHM, MeasuredPSF
 from bayesfred.model.information_loss import InformationLoss
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -103,6 +103,29 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
             "fit_psf makes one"
         )
     return _marginalized(replace(posterior, loss=None), psf, estimate.params, 0.0)
+
+
+def psf_message(posterior: Posterior) -> str:
+    """Say in a line what was found of a PSF.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With a `MeasuredPSF`.
+
+    Returns
+    -------
+    str
+    """
+    psf = posterior.model.psf
+    assert isinstance(psf, MeasuredPSF), "one was measured"
+    here = "" if posterior.loss is None or posterior.loss.absorbed else " on another frame"
+    varies = f", varying with degree {psf.degree} over the field" if psf.degree else ""
+    left = f"{psf.model_error:.1%} of the light unexplained" if psf.model_error else "noise is left"
+    return (
+        f"psf: measured{here}, FWHM {FWHM * psf.sigma:.2f} pixel with the pixel in it{varies}, "
+        f"{psf.determined:.0f} numbers determined, {left}"
+    )
 
 
 def _marginalized(
