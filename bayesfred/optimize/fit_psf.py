@@ -56,7 +56,8 @@ def fit_psf(
     oversampling : int
         Knots per pixel, of PSFs with a FWHM up to 1.5 pixels; wider ones have as many per FWHM.
     degree : int
-        Of the polynomial by which the PSF varies over the field; 0 if it does not.
+        Of the polynomial by which the PSF varies over the field; 0 if it does not. The variation
+        has half as many knots per pixel, three per FWHM.
 
     Returns
     -------
