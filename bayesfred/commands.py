@@ -274,8 +274,7 @@ def report(
         Parameters to show in pairs; by default all, or of more than twelve those of the most
         correlated pairs.
     out : path-like, optional
-        The page, .html; by default beside the chain. The picture, .png, and the table of sources,
-        .sources.ecsv, go beside the page.
+        The page, .html; by default beside the chain. The other files go beside the page.
     overwrite : bool
         Replace page, picture and table.
 
@@ -289,16 +288,14 @@ def report(
         If the chain is missing, damaged, or named as its page or picture would be; if a page,
         picture or table exists, or `corner` names what is no parameter.
     """
-    path = Path(chain_file)
-    chain = open_chain(path)
-    page, *others = outputs.beside(path if out is None else Path(out))
-    if out is not None:
-        page = Path(out)
+    path, chain = Path(chain_file), open_chain(chain_file)
+    default, *others = outputs.beside(path if out is None else Path(out))
+    page = default if out is None else Path(out)
     if isinstance(chain.posterior().model.psf, MeasuredPSF):
         others.append(outputs.psf_beside(page))
     outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
-    target = target_ess or chain.target_ess
-    return pipeline.write_results(chain, path, page, target_ess=target, corner=corner)
+    ess = target_ess or chain.target_ess
+    return pipeline.write_results(chain, path, page, target_ess=ess, corner=corner)
 
 
 def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Verification:
