@@ -22,7 +22,7 @@ from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.io.frames import write_frame
-from bayesfred.model.noise import GaussianNoise, PoissonNoise, simulate
+from bayesfred.model.noise import GaussianNoise, simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
@@ -166,11 +166,11 @@ def test_no_distortion_and_one_too_small_to_matter_take_the_leanest_polynomial()
 
 
 def test_everything_else_of_the_posterior_is_kept() -> None:
-    nuisances = Nuisances("free", offset=True, psf_sigma=True, background_order=1)
+    nuisances = Nuisances("scale", offset=True, psf_sigma=True, background_order=1)
     mask = np.ones(SHAPE, bool)
     mask[10:14, 20:30] = False
     prior = {"background": stats.gamma(9.0, scale=LEVEL / 9.0), "offset_x": stats.norm(0.0, 0.5)}
-    noise = PoissonNoise(0.5)
+    noise = GaussianNoise(9.0)
     given = lens(6, nuisances=nuisances, mask=mask, prior=prior, noise=noise)
     kept = choose_terms(given).posterior
     assert kept.nuisances == nuisances and kept.noise == noise
