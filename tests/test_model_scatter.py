@@ -26,6 +26,7 @@ from bayesfred.optimize.find_map import find_map
 
 Floats = NDArray[np.float64]
 
+DOF = 3.0
 SCATTER = Nuisances("free", offset=True, psf_sigma=True, background_order=1, position_scatter=True)
 
 
@@ -128,7 +129,8 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
 
     def value(z: Floats) -> float:
         fluxes, shifts = np.exp(z[:n]), tau * z[n:]
-        prior = stats.norm(0, tau).logpdf(shifts).sum()
+        student = stats.multivariate_t(shape=tau**2 * np.eye(2), df=DOF)
+        prior = student.logpdf(shifts.reshape(-1, 2)).sum()
         stamps = templates(np.concatenate([fluxes, shifts]))
         return float(joint(posterior, stamps, level, fluxes) + prior)
 
@@ -142,8 +144,10 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
 
     steps = np.append(1e-3 * phi[:n], np.full(2 * n, 1e-2))
     slopes = np.stack([five_point(mean, phi, k, steps[k]) for k in range(3 * n)])
+    square = np.repeat(np.sum(phi[n:].reshape(n, 2) ** 2, axis=1), 2)
+    curvature = (DOF + 2) / (DOF * tau**2 + square)  # slope of log prior over the shift
     h = (slopes * posterior.counts.ravel() / mean(phi) ** 2) @ slopes.T + np.diag(
-        np.append(2 * phi[:n] ** -2, np.full(2 * n, tau**-2))
+        np.append(2 * phi[:n] ** -2, curvature)
     )
     expected = value(found.x) + 1.5 * n * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(h)[1]
     expected -= found.x[:n].sum()  # the density is that of log F, H that in F
@@ -175,7 +179,8 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     outer = np.stack([five_point(image, params, i, STEP * scale[i]) for i in others])
     weight = 1 / mean(phi)
     inner = (slopes * weight) @ slopes.T
-    h = inner + np.diag(np.append(2 * phi[:n] ** -2, np.full(2 * n, tau**-2)))
+    known_shifts = (DOF + 2) / (DOF + 4) * curvature
+    h = inner + np.diag(np.append(2 * phi[:n] ** -2, known_shifts))
     cross = (outer * weight) @ slopes.T
     schur = (outer * weight) @ outer.T - cross @ np.linalg.solve(h, cross.T)
     fisher = posterior.fisher(params)
@@ -188,10 +193,9 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     if (
         case == "bright"
     ):  # a source's two coordinates are nearly independent: each alone tells of the scatter
-        variance = np.diag(np.linalg.inv(measured))[n:]
-        assert fisher[k, k] == pytest.approx(
-            np.sum(2 * tau**2 / (tau**2 + variance) ** 2), rel=0.01
-        )
+        left = known_shifts * np.diag(np.linalg.inv(measured))[n:]
+        share = 2 * DOF / (DOF + 4) / tau**2
+        assert fisher[k, k] == pytest.approx(np.sum(share / (1 + left) ** 2), rel=0.01)
     assert not fisher[k, others].any()
 
 

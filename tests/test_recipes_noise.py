@@ -50,15 +50,15 @@ class VarianceTerms(NamedTuple):
     w: Floats
 
     @staticmethod
-    def log_density(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         return -0.5 * noise.w[p] * (n - mu) * (n - mu)
 
     @staticmethod
-    def derivatives(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         return noise.w[p] * (n - mu), noise.w[p], 0.0
 
     @staticmethod
-    def information(noise: Any, mu: Any, p: Any) -> Any:
+    def information(noise: Any, mu: Any, light: Any, p: Any) -> Any:
         return noise.w[p]
 
 

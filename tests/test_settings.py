@@ -68,6 +68,7 @@ def test_defaults(tmp_path: Path) -> None:
             "background_order": 0,
             "position_scatter": False,
             "flux_shape": 2.0,
+            "model_error": False,
         },
         "prior": {},
         "sampling": {"seed": 1, "ensembles": 4, "walkers": 32, "target_ess": 1000},

@@ -57,11 +57,11 @@ def absorbed(
     response, free = responses(posterior, params, fits), posterior.nuisances.profiled
     alone = np.zeros((fits.fluxes.size, 4, 4))
     if free:
-        prior = np.full(free, posterior.nuisances.flux_shape)  # of a relative flux
-        if free > 1:
-            scatter = params[posterior.parameter_names.index("position_scatter")]
-            prior[1:] = scatter**-2.0
-        inverse = np.linalg.inv(fits.information[:, :free, :free] + np.diag(prior))
+        prior = np.zeros((fits.fluxes.size, free, free))
+        prior[:, 0, 0] = posterior.nuisances.flux_shape  # of a relative flux
+        for k in range(1, free):
+            prior[:, k, k] = 1.0 / fits.scatter
+        inverse = np.linalg.inv(fits.information[:, :free, :free] + prior)
         response[:, :free] -= inverse @ fits.information[:, :free] @ response
         alone[:, :free, :free] = inverse
     spread = alone + response @ covariance @ response.swapaxes(1, 2)

@@ -53,6 +53,7 @@ from bayesfred.analysis.agreement import Agreement, Verdict
 from bayesfred.analysis.folds import Folds, fold_sources
 from bayesfred.analysis.sources import source_table
 from bayesfred.errors import InputError
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.optimize.find_map import CLOSENESS, find_map
@@ -345,7 +346,9 @@ def _predicted(half: Posterior, other: _Half, sources: Flags) -> Agreement:
     covariance = inverse(information[np.ix_(free, free)])[np.ix_(wanted, wanted)]
     field = _field(half, other.params, np.column_stack([u, v])[found])
     errors = np.concatenate([du_sd[found], dv_sd[found]]) ** 2
-    errors += named.get("position_scatter", 0.0) ** 2
+    tau = named.get("position_scatter", 0.0)
+    square = np.tile((du[found] ** 2 + dv[found] ** 2) / DOF, 2)
+    errors += (tau**2 + square) * DOF / (DOF + 2.0) if tau else 0.0
     lower = linalg.cholesky(field @ covariance @ field.T + np.diag(errors), lower=True)
     away = np.concatenate([du[found], dv[found]])
     return Agreement.of(linalg.solve_triangular(lower, away, lower=True))

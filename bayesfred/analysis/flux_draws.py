@@ -73,6 +73,7 @@ def draw_fluxes(
     reach = psf.support_radius(UNSEEN)
     reach *= named.get("psf_sigma", psf.sigma) / psf.sigma
     own, expected, fluxes, _ = posterior.likelihood.own_pixels(params, reach)
+    law = posterior.noise_at(params)
     mean, counts, drawn = expected.ravel(), posterior.counts.ravel(), fluxes.copy()
     shape = posterior.nuisances.flux_shape
     coupled = _coupling(own) > COUPLED
@@ -81,7 +82,7 @@ def draw_fluxes(
             some = slice(own.first[s], own.first[s + 1])
             pixel, template = own.pixel[some], own.templates[0, some] / fluxes[s]
             others = mean[pixel] - drawn[s] * template
-            noise = posterior.noise.at(np.unravel_index(pixel, posterior.counts.shape))
+            noise = law.at(np.unravel_index(pixel, posterior.counts.shape))
             mean_flux = float(posterior.model.sources.flux[s])
 
             def log_density(

@@ -29,7 +29,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import Noise, PoissonNoise
-from bayesfred.model.parameters import Nuisances, displacing
+from bayesfred.model.parameters import SCALES, Nuisances, displacing
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 from bayesfred.optimize.fit_statistics import fit_statistics
@@ -312,11 +312,12 @@ def noise_study(
     ([0.5, 50.0], True)
     """
     check("noise study", replicates, method)
-    if nuisances.position_scatter:
-        raise InputError(
-            "noise study: got position_scatter, expected sources at their positions: fit without, "
-            "or calibrate instead"
-        )
+    for name in SCALES:
+        if getattr(nuisances, name):
+            raise InputError(
+                f"noise study: got {name}, expected sources as the model has them: fit without, or "
+                "calibrate instead"
+            )
     if psf_sigma and not isinstance(model.psf, GaussianPSF):
         raise InputError(
             "noise study: psf_sigma: got widths, expected none: only a Gaussian PSF's width is "

@@ -26,6 +26,7 @@ from bayesfred.analysis.field import (
 )
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 
@@ -130,18 +131,18 @@ def _brighter(posterior: Posterior, params: Floats, fluxes: Floats) -> Posterior
     scale = params[names.index("flux_scale")] if "flux_scale" in names else 1.0
     s = p.model.sources
     model = replace(p.model, sources=SourceCatalog(s.x, s.y, fluxes / scale))
-    # free fluxes would be those of the old counts, and the scatter is no part of the mean
+    # free fluxes would be those of the old counts, and the scales are no part of the mean
     flux = "fixed" if p.nuisances.flux == "free" else p.nuisances.flux
-    kept = [name != "position_scatter" for name in names]
+    kept = [name not in SCALES for name in names]
     known = Posterior(
         model,
         p.counts,
         prior={name: p.prior[name] for name, keep in zip(names, kept, strict=True) if keep},
         noise=p.noise,
         mask=p.mask,
-        nuisances=replace(p.nuisances, flux=flux, position_scatter=False),
+        nuisances=replace(p.nuisances, flux=flux, position_scatter=False, model_error=False),
     )
-    if not p.nuisances.profiled:  # the information does not depend on the counts
+    if known.nuisances == p.nuisances:  # the information does not depend on the counts
         return known
     counts = known.expected_counts(params[kept])
     return Posterior(

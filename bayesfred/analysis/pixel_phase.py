@@ -74,8 +74,8 @@ def pixel_phase(
     moves = fits.to_image @ responses(posterior, params, fits)[:, 1:3] / step
     variance = np.diagonal(fits.moved_covariance, axis1=1, axis2=2) / step**2
     if posterior.nuisances.position_scatter:
-        scatter = params[posterior.parameter_names.index("position_scatter")] / step
-        variance = variance + scatter**2 * np.sum(fits.to_image**2, axis=2)
+        scatter = fits.scatter[:, None] / step**2
+        variance = variance + scatter * np.sum(fits.to_image**2, axis=2)
     middle = 0.5 * (np.array(posterior.counts.shape[::-1]) - 1.0)
     place = fits.own.image / step + middle
     phase = place - np.rint(place)

@@ -33,6 +33,7 @@ from bayesfred.analysis.score_tests import ScoreTests, score_tests
 from bayesfred.analysis.source_tests import SourceTests, source_tests
 from bayesfred.analysis.sources import SourceFits, fit_sources, tabulate
 from bayesfred.io.summary_table import Table
+from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 
 __all__ = ["Residuals", "judge_residuals", "predictive_checks", "randomised_pit"]
@@ -90,9 +91,8 @@ def judge_residuals(
     Residuals
     """
     fits = fit_sources(posterior, params)
-    level = float(params[posterior.parameter_names.index("background")])
     taken = absorbed(posterior, params, covariance, fits)
-    pit = randomised_pit(posterior, fits, level, seed=seed, leverage=taken.leverage)
+    pit = randomised_pit(posterior, params, fits, seed=seed, leverage=taken.leverage)
     phases = pixel_phase(posterior, params, covariance, fits)
     scores = score_tests(posterior, params)
     tests = source_tests(posterior, params, covariance, fits, taken)
@@ -108,7 +108,7 @@ def judge_residuals(
             *scores.checks,
             *tests.checks,
             pit_check(pit),
-            *_whiteness(posterior, fits, level, taken.modes),
+            *_whiteness(posterior, params, fits, taken.modes),
             *(phase_check(phase, axis) for phase, axis in zip(phases, "uv", strict=True)),
         ),
     )
@@ -119,8 +119,8 @@ def judge_residuals(
 
 def randomised_pit(
     posterior: Posterior,
+    params: Floats,
     fits: SourceFits,
-    level: float,
     *,
     seed: int = 0,
     leverage: Floats | None = None,
@@ -130,9 +130,9 @@ def randomised_pit(
     Parameters
     ----------
     posterior : Posterior
+    params : ndarray, shape (d,)
     fits : SourceFits
         For the expected counts.
-    level : float, counts per pixel
         The background.
     seed : int
     leverage : ndarray, shape (ny * nx,), optional
@@ -145,7 +145,8 @@ def randomised_pit(
     """
     used = posterior.mask
     counts = posterior.counts[used]
-    noise = posterior.noise.at(used)
+    noise = posterior.noise_at(params).at(used)
+    level = float(params[posterior.parameter_names.index("background")])
     u = _uniform(
         noise.cumulative(counts, fits.expected[used], level, grain(counts)),
         np.random.default_rng(seed),
@@ -189,12 +190,17 @@ def pit_check(pit: Floats | None) -> Check:
 # --- whiteness ------------------------------------------------------------------------------------
 
 
-def _whiteness(posterior: Posterior, fits: SourceFits, level: float, modes: Floats) -> list[Check]:
+def _whiteness(
+    posterior: Posterior, params: Floats, fits: SourceFits, modes: Floats
+) -> list[Check]:
     """Correlations of residuals one and two pixels apart, along u and along v."""
     used = posterior.mask
     residual = np.zeros(used.shape)
-    residual[used] = posterior.noise.at(used).residual(
-        posterior.counts[used], fits.expected[used], level
+    level = float(params[posterior.parameter_names.index("background")])
+    residual[used] = (
+        posterior.noise_at(params)
+        .at(used)
+        .residual(posterior.counts[used], fits.expected[used], level)
     )
     background = len(posterior.nuisances.background_names)
     checks = []
@@ -262,9 +268,10 @@ def predictive_checks(posterior: Posterior, draws: Floats, *, seed: int = 0) -> 
     found = np.empty((len(draws), 2, len(PREDICTED)))
     for params, pair in zip(draws, found, strict=True):
         mu, level = posterior.expected_counts(params), float(params[index])
-        simulated = posterior.noise.draw(mu - level, level, rng)
+        noise, base = posterior.noise_at(params), posterior.likelihood.background(params)
+        simulated = noise.draw(mu - base, base, rng)
         for counts, row in zip((posterior.counts, simulated), pair, strict=True):
-            row[:] = _discrepancies(posterior, counts[used], mu[used], level, rng)
+            row[:] = _discrepancies(noise.at(used), counts[used], mu[used], level, rng)
     return [
         not_tested(name, "no draws, or no distribution function")
         if not len(draws) or np.isnan(values).any()
@@ -274,10 +281,9 @@ def predictive_checks(posterior: Posterior, draws: Floats, *, seed: int = 0) -> 
 
 
 def _discrepancies(
-    posterior: Posterior, counts: Floats, mu: Floats, level: float, rng: np.random.Generator
+    noise: Noise, counts: Floats, mu: Floats, level: float, rng: np.random.Generator
 ) -> tuple[float, ...]:
     """Deviance, Pearson's statistic, largest residual and the PIT's chi-square of a frame."""
-    noise = posterior.noise.at(posterior.mask)
     residual = noise.residual(counts, mu, level)
     pit = _uniform(noise.cumulative(counts, mu, level, grain(counts)), rng)
     return (

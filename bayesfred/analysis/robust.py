@@ -68,7 +68,7 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
         return np.full(params.size, np.nan)
     level = float(params[posterior.parameter_names.index("background")])
     residual = (posterior.counts - fits.expected).ravel()[order]
-    weight = 1.0 / posterior.noise.counts_variance(fits.expected, level).ravel()[order]
+    weight = 1.0 / posterior.noise_at(params).counts_variance(fits.expected, level).ravel()[order]
     # in units in which the covariance is 1
     root = np.linalg.cholesky(covariance)
     response = absorbed(posterior, params, covariance, fits).response @ root

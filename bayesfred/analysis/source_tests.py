@@ -216,7 +216,7 @@ def _slope(posterior: Posterior, params: Floats, fits: SourceFits) -> Floats:
     """
     level = float(params[posterior.parameter_names.index("background")])
     pixel, variance = fits.own.pixel, 1.0 / fits.sums.weight
-    noise = posterior.noise.at(np.unravel_index(pixel, posterior.counts.shape))
+    noise = posterior.noise_at(params).at(np.unravel_index(pixel, posterior.counts.shape))
     step = STEP * variance
     more = noise.counts_variance(fits.expected.ravel()[pixel] + step, level + step)
     return np.asarray((more - variance) / step)

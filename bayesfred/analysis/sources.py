@@ -39,6 +39,7 @@ from scipy import spatial
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.io.summary_table import Table, make_table
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.sources import OwnPixels, fit_templates
 from bayesfred.model.posterior import Posterior
 
@@ -87,6 +88,11 @@ class SourceFits:
         Displacements of the images along u and v from where the distortion has them.
     to_image : ndarray, shape (s, 2, 2)
         Displacement of the image by a shift along a and b.
+    scatter : ndarray, shape (s,), pixel^2
+        Where positions scatter, the variance of a normal prior of the curvature that theirs has at
+        the shift found, large for a source far off; 0 where they do not.
+    place_weight : ndarray, shape (s,)
+        By which factor that curvature is less than for a source in its place.
     """
 
     own: OwnPixels
@@ -100,6 +106,8 @@ class SourceFits:
     moved: Floats
     moved_covariance: Floats
     to_image: Floats
+    scatter: Floats
+    place_weight: Floats
 
 
 def source_table(posterior: Posterior, params: Floats) -> Table:
@@ -119,7 +127,9 @@ def source_table(posterior: Posterior, params: Floats) -> Table:
         counts its pixels in the likelihood; `chi2` is their deviance, `chi2_z` its excess over the
         expectation in standard deviations. `flux_ratio` is the light found over the model's, `du`,
         `dv` by how much the image is displaced from where the model has it, `width_ratio` the width
-        of the PSF found over the model's; `_sd` is a standard deviation. `peak` is the largest
+        of the PSF found over the model's; `_sd` is a standard deviation. `place_weight` is 1 for a
+        source that tells of the distortion as others do, and small where positions scatter and its
+        own lies far off. `peak` is the largest
         count, `phase_u`, `phase_v` the image's position within its pixel, -0.5 to 0.5; `isolated`
         is whether other sources have less than 1 % of its light among its pixels. Image positions
         and displacements are in recorded pixels, u and v from the middle of the frame.
@@ -162,17 +172,21 @@ def fit_sources(posterior: Posterior, params: Floats) -> SourceFits:
     radius = WIDTHS * sigma + REACH * float(model.detector.binning)
     own, expected, fluxes, shifts = posterior.likelihood.own_pixels(params, radius)
     owner = np.repeat(np.arange(fluxes.size), np.diff(own.first))
-    sums = _sum_up(posterior, (own, owner), expected.ravel(), named["background"])
+    sums = _sum_up(posterior, (own, owner), expected.ravel(), np.asarray(params))
     near = _neighbours(own, radius)
     found, covariance, information = fit_templates(own, sums.weight, sums.pull, near)
     found, covariance = _per_light(found, covariance)
     slopes = np.where(np.isfinite(own.image[:, :1]), own.slopes, np.eye(2).ravel())
     to_image = np.linalg.inv(slopes.reshape(-1, 2, 2))
+    tau = named.get("position_scatter", 0.0)
+    off = np.sum(shifts**2, axis=1) / (DOF * tau**2) if tau else np.zeros(fluxes.size)
     return SourceFits(
         own, owner, expected, fluxes, sums, information, found, covariance,
         moved=np.einsum("sij,sj->si", to_image, shifts + found[:, 1:3]),
         moved_covariance=to_image @ covariance[:, 1:3, 1:3] @ to_image.swapaxes(1, 2),
         to_image=to_image,
+        scatter=tau**2 * (1.0 + off) * DOF / (DOF + 2.0),
+        place_weight=1.0 / (1.0 + off),
     )  # fmt: skip
 
 
@@ -213,6 +227,7 @@ def tabulate(posterior: Posterior, fits: SourceFits) -> Table:
             "dv": fits.moved[:, 1] / step,
             "du_sd": np.sqrt(fits.moved_covariance[:, 0, 0]) / step,
             "dv_sd": np.sqrt(fits.moved_covariance[:, 1, 1]) / step,
+            "place_weight": fits.place_weight,
             "width_ratio": 1.0 + found[:, 3],
             "width_ratio_sd": np.sqrt(fits.covariance[:, 3, 3]),
             "peak": sums.peak,
@@ -224,10 +239,11 @@ def tabulate(posterior: Posterior, fits: SourceFits) -> Table:
 
 
 def _sum_up(
-    posterior: Posterior, pixels: tuple[OwnPixels, Ints], expected: Floats, level: float
+    posterior: Posterior, pixels: tuple[OwnPixels, Ints], expected: Floats, params: Floats
 ) -> SourceSums:
     """Compare the counts of all sources' pixels with their expectation."""
     (own, owner), counts = pixels, posterior.counts.ravel()
+    law, level = posterior.noise_at(params), params[posterior.parameter_names.index("background")]
     size, profiled = own.first.size - 1, posterior.nuisances.profiled
     sums, peak = np.zeros((6, size)), np.full(size, -np.inf)
     weight, pull = np.empty(own.pixel.size), np.empty(own.pixel.size)
@@ -235,7 +251,7 @@ def _sum_up(
         block = slice(first, first + BLOCK)
         pixel, source, light = own.pixel[block], owner[block], own.templates[0, block]
         n, mu = counts[pixel], expected[pixel]
-        noise = posterior.noise.at(np.unravel_index(pixel, posterior.counts.shape))
+        noise = law.at(np.unravel_index(pixel, posterior.counts.shape))
         with np.errstate(all="ignore"):  # what is not finite is said so
             w = 1.0 / noise.counts_variance(mu, level)
             mean, _, slope = noise.deviance_moments(mu, level)

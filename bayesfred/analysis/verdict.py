@@ -32,6 +32,8 @@ MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
 MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
 LEAST_MODE = 0.01  # share of the draws from which a mode is told of
+HARDLY = 0.1  # share of its weight below which a source far off its position is named
+MOST_NAMED = 10
 WIDER = 1.1  # factor of the errors from which it is said
 
 
@@ -107,6 +109,7 @@ def judge_fit(
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
+    sentence += _far_off(residuals)
     return FitVerdict(fits, causes, sentence, _omitted(posterior, fit, fits), unmatched)
 
 
@@ -254,6 +257,23 @@ def _failures(residuals: Residuals) -> str:
     return ", ".join(parts)
 
 
+def _far_off(residuals: Residuals | None) -> str:
+    """The sources so far off their positions that they hardly count, by name."""
+    if residuals is None:
+        return ""
+    table = residuals.sources
+    far = table[table["place_weight"] < HARDLY]
+    if not len(far):
+        return ""
+    far.sort("place_weight")
+    named = [f"{row['id']} by {np.hypot(row['du'], row['dv']):.2g} px" for row in far[:MOST_NAMED]]
+    more = f" and {len(far) - MOST_NAMED} more" if len(far) > MOST_NAMED else ""
+    return (
+        f" {len(far)} of {len(table)} sources lie far off the catalogue and hardly count: "
+        f"{', '.join(named)}{more}."
+    )
+
+
 def _why(causes: tuple[Cause, ...]) -> str:
     """The first cause with what to do, and the names of the others."""
     if not causes:
@@ -267,13 +287,19 @@ def _why(causes: tuple[Cause, ...]) -> str:
     )
 
 
+def _listed(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
 def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
     """What the error bars leave out."""
     nuisances = posterior.nuisances
     left_out = [] if nuisances.position_scatter else ["the catalogue's positions"]
     left_out += ["its fluxes"] if nuisances.flux == "fixed" else []
-    left_out += ["the PSF's shape" if nuisances.psf_sigma else "the PSF", "the choice of terms"]
-    sentence = f"The error bars leave out errors of {', '.join(left_out[:-1])} and {left_out[-1]}"
+    if not nuisances.model_error:
+        left_out.append("the PSF's shape" if nuisances.psf_sigma else "the PSF")
+    left_out += ["the choice of terms"]
+    sentence = f"The error bars leave out errors of {_listed(left_out)}"
     factor = (max(fit["pearson"], 0.0) / max(fit["pearson_expected"], 1.0)) ** 0.5
     if fits or not WIDER < factor < np.inf:
         return f"{sentence}{'' if fits else ', and the misfit'}."

@@ -195,7 +195,7 @@ class ForwardModel:
         if not isinstance(self.distortion, PolynomialDistortion):
             return self._every_pixel() + background
         out = np.full(ny * stride(nx), float(background))
-        nuisances = SourceNuisances(1.0, 0.0, 0.0, self.psf.sigma, 0.0)
+        nuisances = SourceNuisances(1.0, 0.0, 0.0, self.psf.sigma, 0.0, 0.0)
         render(self._optics, self._monomial_coefficients(theta), nuisances, self.sources.flux, out)
         return out.reshape(ny, -1)[:, :nx]
 

@@ -20,6 +20,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Optics, stride
 from bayesfred.imaging.kernels.render import render as render_sources
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.contexts import (
     LIMIT,
     MASKED,
@@ -37,15 +38,16 @@ from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
 from bayesfred.model.kernels.sources import OwnPixels, own_pixels
-from bayesfred.model.noise import Noise
+from bayesfred.model.noise import ModelErrorNoise, Noise, model_error_terms
 from bayesfred.model.parameters import (
-    BACKGROUND_POWERS,
     BACKGROUND_TERMS,
+    SCALES,
     SOURCE_NUISANCES,
     Nuisances,
     Parameter,
     displacing,
 )
+from bayesfred.model.pixels import polynomial_background
 from bayesfred.model.threads import share
 
 BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
@@ -122,8 +124,8 @@ class FrameLikelihood:
             return self
         out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
-            slope, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
-        if not np.isfinite(slope):
+            slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
+        if not np.isfinite(slopes[0]):
             return replace(self, extrapolation=None)
         extrapolation = flux_extrapolation(
             self.model, self.fluxes, rendered, z[:, 0], params, covariance
@@ -135,10 +137,10 @@ class FrameLikelihood:
         sources, background = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
             out = sources, background
-            slope, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
-        if np.isnan(slope):
+            slopes, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
+        if np.isnan(slopes[0]):
             return np.full(len(self.parameters), np.nan)
-        return np.asarray(np.concatenate([sources, [slope], background]) @ self._chain_rule(params))
+        return np.asarray(np.concatenate([sources, slopes, background]) @ self._chain_rule(params))
 
     def fisher(self, params: Floats) -> Floats:
         """Fisher information, free fluxes profiled out, shape (d, d); NaN where there is none."""
@@ -146,14 +148,16 @@ class FrameLikelihood:
         others = np.zeros((sources + terms, sources + terms))
         with self._rendered(params) as (w, rendered, parameters):
             known = fisher(self._problem, w, rendered, parameters, self._basis, others)
-        if np.isnan(known):
+        if np.isnan(known[0]):
             return np.full((len(self.parameters),) * 2, np.nan)
-        # the scatter is independent of the others: it is known by the shifts' size alone
-        size = sources + 1 + len(BACKGROUND_TERMS)
+        # scatter and model error are independent of the others: the size of shifts and residuals
+        # tells of them
+        apart, size = len(SCALES), sources + len(SCALES) + len(BACKGROUND_TERMS)
         out = np.zeros((size, size))
-        index = [*range(sources), *range(sources + 1, sources + 1 + terms)]
+        index = [*range(sources), *range(sources + apart, sources + apart + terms)]
         out[np.ix_(index, index)] = others
-        out[sources, sources] = known
+        own = slice(sources, sources + apart)
+        out[own, own] = np.diag(known)
         change = self._chain_rule(params)
         return np.asarray(change.T @ out @ change)
 
@@ -199,7 +203,7 @@ class FrameLikelihood:
             frame = self.mask, w.image.reshape(self.mask.shape[0], -1)
             own = own_pixels(optics, parameters, (fluxes, shifts), radius, frame)
             sources = frame[1][:, : self.mask.shape[1]].copy()
-        level = self._background(parameters.background)
+        level = polynomial_background(self.mask.shape, parameters.background)
         return own, sources + level, fluxes, shifts
 
     def draw_fluxes(self, rng: np.random.Generator) -> Floats:
@@ -231,22 +235,32 @@ class FrameLikelihood:
         if nuisances.position_scatter:
             # a shift is as imaged: it moves the image, and leaves the distortion that of the
             # catalogue's position
-            by_x, by_y = nuisances.position_scatter * rng.standard_normal((2, flux.size))
+            scale = nuisances.position_scatter * np.sqrt(DOF / rng.chisquare(DOF, flux.size))
+            by_x, by_y = scale * rng.standard_normal((2, flux.size))
             out[:] = 0.0
             moved = optics._replace(x=optics.x + by_x, y=optics.y + by_y)
             render_sources(moved, theta, at_rest, flux, out)
         sources = out.reshape(ny, -1)[:, :nx]
-        level = self._background(background)
+        level = polynomial_background(self.mask.shape, background)
         if not (unfolded and np.all((sources + level)[self.mask] >= 0.0)):
             return None
-        return self.noise.draw(sources, np.maximum(level, -sources), rng)
+        return self.noise_at(params).draw(sources, np.maximum(level, -sources), rng)
+
+    def noise_at(self, params: Floats) -> Noise:
+        """The noise with the model error that the parameters state."""
+        parameters = self._one(params)
+        if not self.nuisances.model_error:
+            return self.noise
+        level = parameters.background
+        slope = polynomial_background(self.mask.shape, level) - level[0]
+        return ModelErrorNoise(self.noise, parameters.nuisances.model_error, slope)
 
     def _expected(self, params: Floats) -> tuple[Floats, Floats]:
         ny, nx = self.model.detector.shape
         with self._rendered(params) as (w, rendered, parameters):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
         bad = 0.0 if rendered.extra > -np.inf else np.nan
-        level = self._background(parameters.background)
+        level = polynomial_background(self.mask.shape, parameters.background)
         return sources + level + bad, rendered.fluxes + bad
 
     def image_positions(self, params: Floats) -> Floats:
@@ -257,15 +271,7 @@ class FrameLikelihood:
 
     def background(self, params: Floats) -> Floats:
         """The background polynomial at every pixel, shape (ny, nx), counts per pixel."""
-        return self._background(self._one(params).background)
-
-    def _background(self, background: Floats) -> Floats:
-        u, v = (np.arange(1 - n, n, 2) / n for n in self.model.detector.shape[::-1])
-        out = np.zeros(self.model.detector.shape)
-        for (m, n), value in zip(BACKGROUND_POWERS, background, strict=True):
-            if value:
-                out += value * u**m * v[:, None] ** n
-        return out
+        return polynomial_background(self.mask.shape, self._one(params).background)
 
     def _arguments(self, vectors: Floats) -> Vectors:
         """Distortion coefficients, source nuisances and background coefficients, a row a vector."""
@@ -292,24 +298,23 @@ class FrameLikelihood:
     def _chain_rule(self, params: Floats) -> Floats:
         """Derivatives of what the kernels differentiate by with respect to the parameters.
 
-        Its rows are the distortion's monomials, the free nuisances of the sources, the scatter and
-        the background's terms. The kernels' derivative by flux is relative to the scaled flux.
+        Its rows are the distortion's monomials, the free nuisances of the sources, `SCALES` and the
+        background's terms. The kernels' derivative by flux is relative to the scaled flux.
         """
         d = self.model.polynomial
         change = np.eye(d.n_terms) if d.basis is None else d.basis
         monomials, sources = len(change), self._basis.row.size
-        free = [name for name in self.nuisances.source_names if name != "position_scatter"]
-        out = np.zeros((sources + 1 + len(BACKGROUND_TERMS), len(self.parameters)))
+        out = np.zeros((sources + len(SCALES) + len(BACKGROUND_TERMS), len(self.parameters)))
         for k, parameter in enumerate(self.parameters):
             if parameter.kind == "distortion":
                 out[:monomials, k] = change[:, parameter.slot]
             elif parameter.kind == "background":
-                out[sources + 1 + parameter.slot, k] = 1.0
-            elif parameter.name == "position_scatter":
-                out[sources, k] = 1.0
+                out[sources + len(SCALES) + parameter.slot, k] = 1.0
+            elif parameter.name in SCALES:
+                out[sources + SCALES.index(parameter.name), k] = 1.0
             else:
                 scale = 1.0 / params[k] if parameter.name == "flux_scale" else 1.0
-                out[monomials + free.index(parameter.name), k] = scale
+                out[monomials + self._moving.index(parameter.name), k] = scale
         return out
 
     @contextmanager
@@ -341,8 +346,12 @@ class FrameLikelihood:
 
     @cached_property
     def _basis(self) -> Basis:
-        free = [name for name in self.nuisances.source_names if name != "position_scatter"]
-        return self.model.basis(free)
+        return self.model.basis(self._moving)
+
+    @property
+    def _moving(self) -> list[str]:
+        """The free nuisances that change the expected counts."""
+        return [name for name in self.nuisances.source_names if name not in SCALES]
 
     @property
     def _flux(self) -> Floats:
@@ -373,11 +382,14 @@ class FrameLikelihood:
         values[:, :nx] = np.where(self.mask, self.counts, MASKED)
         used = (values > LIMIT).reshape(-1, SEGMENT)
         total = np.where(used, values.reshape(-1, SEGMENT), 0.0).sum(axis=1)
-        noise, varies = self.noise.terms(values), self.nuisances.background_order > 0
+        noise = base = self.noise.terms(values)
+        if self.nuisances.model_error:
+            noise = model_error_terms(self.noise, values, self.counts, self.mask)
+        varies = self.nuisances.background_order > 0
         return Frame(
             values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
             float(total.sum()), ny, nx, noise, varies,
-            everywhere=varies or not hasattr(noise, "unreached"),
+            everywhere=varies or not hasattr(base, "unreached"),
         )  # fmt: skip
 
     @cached_property

@@ -48,14 +48,20 @@ class Nuisances:
         with sources that the catalogue lacks. `follow_images` puts the images in the place of the
         catalogue's positions; so do run files.
     position_scatter : bool
-        Whether the sources lie off their catalogue positions, by normal errors of unknown standard
-        deviation along each axis: parameter `position_scatter`, pixel, as imaged. Needs free
-        fluxes. Like these, the shifts are not sampled.
+        Whether the sources lie off their catalogue positions: parameter `position_scatter`, pixel,
+        as imaged, the scale of Student's t distribution with 3 degrees of freedom, whose heavy
+        tails hold sources that are far off. Needs free fluxes. Like these, the shifts are not
+        sampled.
     flux_shape : float
         Shape of the free fluxes' Gamma prior, at least 1, which has the relative standard deviation
         1/sqrt(flux_shape): 2, the default, says little, 25 that the catalogue's fluxes are right to
         20 %. With 1 a PSF's width from 1,000 sources of 5 photons is biased by 0.2 standard
         deviations, from 2 on by less than 0.1.
+    model_error : bool
+        Whether the sources' light is known to a fraction only, as where the PSF is not quite
+        right: parameter `model_error`, the fraction eps. The variance of a pixel's counts is that
+        of the noise plus the square of eps times the sources' light in it, as independent errors
+        of the pixels.
 
     Raises
     ------
@@ -75,6 +81,7 @@ class Nuisances:
     footprint: float | None = None
     position_scatter: bool = False
     flux_shape: float = field(default=2.0, metadata={"since": 5})
+    model_error: bool = field(default=False, metadata={"since": 6})
 
     def __post_init__(self) -> None:
         if self.flux not in get_args(FluxMode):
@@ -172,7 +179,12 @@ SOURCE_NUISANCES = (
         "position_scatter", 1, lambda n: n.position_scatter, _zero, lambda sigma: 0.1 * sigma,
         lambda c: stats.gamma(2.0, scale=0.1 * c.sigma),
     ),
+    _SourceNuisance(
+        "model_error", 0, lambda n: n.model_error, _zero, lambda sigma: 0.01,
+        lambda c: stats.gamma(2.0, scale=0.02),
+    ),
 )  # fmt: skip
+SCALES = ("position_scatter", "model_error")  # they leave the expected counts as they are
 BACKGROUND_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v, in slot order
 BACKGROUND_TERMS = (
     "background",
@@ -193,8 +205,9 @@ class Parameter:
     those of the pointing offsets. The background is half-normal with ten times the frame's level,
     its slopes normal with that level; a common flux factor is log-normal by a factor e; the PSF's
     width is normal around the reference width by 30 %, cut at 0.6 and 2 times it. The scatter of
-    the sources' positions is Gamma(2) with a mean of a fifth of that width: a density that vanishes
-    at 0 keeps the maximum off that boundary and costs little where the frame tells otherwise.
+    the sources' positions is Gamma(2) with a mean of a fifth of that width, and so is the model
+    error, with a mean of 4 %: a density that vanishes at 0 keeps the maximum off that boundary and
+    costs little where the frame tells otherwise.
 
     Attributes
     ----------

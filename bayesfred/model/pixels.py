@@ -1,4 +1,4 @@
-"""Which pixels of a frame enter the likelihood, once the frame has been found to be explicable."""
+"""Which pixels of a frame enter the likelihood, and the background polynomial in all of them."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,7 +8,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.noise import Noise
-from bayesfred.model.parameters import Nuisances
+from bayesfred.model.parameters import BACKGROUND_POWERS, Nuisances
 
 
 def usable_pixels(
@@ -63,6 +63,11 @@ def usable_pixels(
         raise InputError(
             f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them"
         )
+    if nuisances.model_error and noise.highest(np.where(used, counts, 1.0)) is None:
+        raise InputError(
+            f"nuisances: model_error: got it with {type(noise).__name__}, expected PoissonNoise or "
+            "GaussianNoise"
+        )
     noise.check(counts, used, nuisances.flux, nuisances.background_order)
     return used
 
@@ -88,3 +93,13 @@ def footprints(detector: Detector, positions: Floats, radius: float) -> Flags:
         near = (u[across] - x) ** 2 + (v[along, None] - y) ** 2 <= radius**2
         inside[np.ix_(along, across)] |= near
     return inside
+
+
+def polynomial_background(shape: tuple[int, ...], coefficients: Floats) -> Floats:
+    """The background polynomial, shape (ny, nx), counts per pixel."""
+    u, v = (np.arange(1 - n, n, 2) / n for n in shape[::-1])
+    out = np.zeros(shape)
+    for (m, n), value in zip(BACKGROUND_POWERS, coefficients, strict=True):
+        if value:
+            out += value * u**m * v[:, None] ** n
+    return out

@@ -308,7 +308,11 @@ class Posterior(TargetDensity):
     def sigma(self, params: npt.ArrayLike) -> Floats:
         """Standard deviation of every pixel's counts under the noise model, shape (ny, nx)."""
         level = self._vector(params)[self.parameter_names.index("background")]
-        return np.sqrt(self.noise.counts_variance(self.expected_counts(params), level))
+        return np.sqrt(self.noise_at(params).counts_variance(self.expected_counts(params), level))
+
+    def noise_at(self, params: npt.ArrayLike) -> Noise:
+        """The noise of the counts, the model error included, given the parameters."""
+        return self.likelihood.noise_at(self._vector(params))
 
     def fluxes(self, params: npt.ArrayLike) -> Floats:
         """Flux of every source, counts: the catalogue's, scaled, or the most likely ones.

@@ -57,7 +57,7 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     fitted = posterior.n_parameters + profiled
     if posterior.loss is not None:
         fitted += round(posterior.loss.absorbed)
-    noise, sums = posterior.noise.at(used), np.zeros(7)
+    noise, sums = posterior.noise_at(params).at(used), np.zeros(7)
     with np.errstate(all="ignore"):  # a mean of zero makes a statistic infinite, which is its value
         # whole frames of intermediate numbers would not fit the caches, or the memory
         for first in range(0, n.size, BLOCK):

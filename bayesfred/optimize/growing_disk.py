@@ -15,6 +15,7 @@ from scipy import ndimage
 from bayesfred._typing import Flags, Floats
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.matching import CENTROID, FEWEST, Field
 from bayesfred.optimize.newton import maximize
@@ -76,9 +77,7 @@ def _part(posterior: Posterior, sources: Flags, pixels: Flags, width: float) -> 
     return Posterior(
         replace(model, sources=few, psf=GaussianPSF(width) if blur > 0 else model.psf),
         ndimage.gaussian_filter(posterior.counts, blur) if blur > 0 else posterior.counts,
-        prior={
-            name: prior for name, prior in posterior.prior.items() if name != "position_scatter"
-        },
+        prior={name: prior for name, prior in posterior.prior.items() if name not in SCALES},
         noise=posterior.noise,
         mask=pixels,
         nuisances=replace(
@@ -86,6 +85,7 @@ def _part(posterior: Posterior, sources: Flags, pixels: Flags, width: float) -> 
             flux="scale" if flux == "free" else flux,
             footprint=None,
             position_scatter=False,
+            model_error=False,
         ),
     )
 

@@ -104,7 +104,7 @@ def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     place = (position + 0.5 * (np.array(detector.shape[::-1]) - 1.0))[:, ::-1]
     expected = posterior.expected_counts(params)
     residual = np.where(posterior.mask, posterior.counts - expected, 0.0)
-    variance = posterior.noise.counts_variance(expected, known["background"])
+    variance = posterior.noise_at(params).counts_variance(expected, known["background"])
     variance = np.where(posterior.mask, variance, 0.0)
 
     sums = np.zeros((5, len(position)))

@@ -145,7 +145,7 @@ class _Residuals:
         self.inside &= posterior.mask[self.row, self.column]
         self.flux = known.get("flux_scale", 1.0) * model.sources.flux
         self.height = 4.0 * np.pi * s**4  # of flux over height
-        self.level = known["background"]
+        self.noise, self.level = posterior.noise_at(params), known["background"]
         self.expected = posterior.expected_counts(params)
 
     def share(self, lost: Flags) -> float:
@@ -164,7 +164,7 @@ class _Residuals:
         light = np.zeros(p.counts.shape)
         mask, near = p.mask, 2 * int(np.ceil(3.0 * s)) + 1
         for _ in range(LOOKS):
-            each = p.noise.counts_variance(expected + np.maximum(light, 0.0), self.level)
+            each = self.noise.counts_variance(expected + np.maximum(light, 0.0), self.level)
             variance = ndimage.gaussian_filter(np.where(p.mask, each, 0.0), s)
             limit = SIGNIFICANCE * np.sqrt(variance / (2.0 * np.pi * s**6))
             limit += SIGNIFICANCE**2 / self.height
@@ -188,7 +188,7 @@ class _Residuals:
             wider = 2 * int(np.ceil(0.25 * s)) + 1  # for detections of another width
             spread = ndimage.maximum_filter(np.abs(light), wider)
             mask = p.mask & (
-                spread <= FAINT * np.sqrt(p.noise.counts_variance(expected, self.level))
+                spread <= FAINT * np.sqrt(self.noise.counts_variance(expected, self.level))
             )
             if self.share(missing | ~mask[self.row, self.column]) > MOST:
                 break

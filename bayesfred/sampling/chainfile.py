@@ -145,14 +145,19 @@ def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) ->
 def _refuse_other_densities(file: h5py.File) -> None:
     """Raise InputError for a chain whose log-probabilities are not those of what would be read.
 
-    Read noise was a shifted Poisson distribution in schema 3, and free fluxes had Laplace's
-    approximation alone before schema 5.
+    Read noise was a shifted Poisson distribution in schema 3, free fluxes had Laplace's
+    approximation alone before schema 5, and positions scattered normally before schema 6.
     """
     schema = file.attrs["schema"]
     if file["posterior/nuisances"].attrs["flux"] == b"free" and schema < 5:
         raise InputError(
             f"nuisances: got free fluxes by Laplace's approximation (schema {schema}), expected "
             "the integral over them that has replaced it: sample the frame again"
+        )
+    if file["posterior/nuisances"].attrs["position_scatter"] and schema < 6:
+        raise InputError(
+            f"nuisances: got positions that scatter normally (schema {schema}), expected Student's "
+            "t distribution that has replaced it: sample the frame again"
         )
     noise = file["posterior/noise"].attrs
     shifted = noise["kind"] == b"noise.poisson" and noise.get("read_noise", 0.0) > 0.0

@@ -207,10 +207,11 @@ def _by_source(posterior: Posterior, params: Floats, draws: Floats) -> Floats:
     """Log-likelihood of the pixels of every source, and of the others; (chain, draw, source)."""
     used, n = posterior.mask, len(posterior.model.sources) + 1
     owner, counts = source_of_pixels(posterior, params), posterior.counts[used]
-    noise, constant = posterior.noise.at(used), posterior.parameter_names.index("background")
+    constant = posterior.parameter_names.index("background")
 
     def one(draw: Floats) -> Floats:
         expected = posterior.expected_counts(draw)[used]
+        noise = posterior.noise_at(draw).at(used)
         each = noise.log_likelihood(counts, expected, draw[constant])
         return np.asarray(np.bincount(owner, each, n), dtype=np.float64)
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats, Ints
+from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.matched import SourceLight, source_light
 
@@ -59,6 +60,11 @@ class Context:
         """Expected counts, shape (ny, nx)."""
         return self.posterior.expected_counts(self.params)
 
+    @cached_property
+    def noise(self) -> Noise:
+        """That of the counts, with the model error."""
+        return self.posterior.noise_at(self.params)
+
     @property
     def level(self) -> float:
         """The background's constant, counts per pixel."""
@@ -72,7 +78,7 @@ class Context:
     @cached_property
     def variance(self) -> Floats:
         """Of every pixel's counts under the noise model."""
-        variance = self.posterior.noise.counts_variance(self.expected, self.level)
+        variance = self.noise.counts_variance(self.expected, self.level)
         return np.where(np.isfinite(variance) & (variance > 0.0), variance, 1.0)
 
     @cached_property
@@ -93,7 +99,7 @@ class Context:
     @property
     def spread(self) -> float:
         """Standard deviation of the misfit of a true model, about."""
-        noise = self.posterior.noise.at(self.used)
+        noise = self.noise.at(self.used)
         one = noise.pearson_variance(self.expected[self.used], self.level)
         return float(np.sqrt(np.sum(one)))
 
@@ -128,7 +134,7 @@ class Context:
         the photons', that of S^2 / B, see `missing_power`.
         """
         bright = np.full_like(self.expected, 1e9)
-        if self.posterior.noise.counts_variance(bright, self.level).max() < 1e8:
+        if self.noise.counts_variance(bright, self.level).max() < 1e8:
             return self.missing_power
         x = self._contrast
         return np.asarray(self.flux * (1.0 - np.log1p(x) / np.maximum(x, 1e-12)))

@@ -45,6 +45,7 @@ class SourceNuisances(NamedTuple):
     offset_y: float
     psf_sigma: float
     position_scatter: float
+    model_error: float  # the sources' light is right to this fraction in every pixel
 
 
 class Geometry(NamedTuple):

@@ -334,5 +334,5 @@ def lay_out(o, geometry, sigma):
 def image_positions(o, theta, offset_x, offset_y, sigma):
     """Where the sources are imaged, shape (s, 2); one without an image stays where it is."""
     geometry = new_geometry(o)
-    locate(o, theta, SourceNuisances(1.0, offset_x, offset_y, sigma, 0.0), geometry)
+    locate(o, theta, SourceNuisances(1.0, offset_x, offset_y, sigma, 0.0, 0.0), geometry)
     return geometry.peak

@@ -334,5 +334,5 @@ def add_jacobian_rows(layout, basis, flux, first, last, out):
 def jacobian(o, theta, sigma, flux, basis, out):
     """d image / d parameters into out (parameters, ny, padded row)."""
     geometry = new_geometry(o)
-    locate(o, theta, SourceNuisances(1.0, 0.0, 0.0, sigma, 0.0), geometry)
+    locate(o, theta, SourceNuisances(1.0, 0.0, 0.0, sigma, 0.0, 0.0), geometry)
     add_jacobian_rows(lay_out(o, geometry, sigma), basis, flux, 0, o.ny, out)

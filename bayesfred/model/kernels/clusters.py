@@ -5,12 +5,22 @@ done cluster by cluster.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesfred.imaging.kernels.compilation import inner
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.contexts import Clusters, Group
+
+DOF = 3.0  # of Student's distribution of the shifts
+
+
+class Prior(NamedTuple):
+    """The prior of a source's flux and shift."""
+
+    shape: float  # of the Gamma distribution of the flux
+    scatter: float  # tau; 0 where positions do not scatter
 
 
 @inner()
@@ -193,11 +203,22 @@ def gram(touching, group, weight, at, out):
 
 
 @inner()
-def add_prior(h, group, size, fluxes, shape, scatter):
-    """Add the priors' curvature to H: a/F^2 for a flux, 1/tau^2 for a shift."""
+def shift_prior(shift, scatter):
+    """Rho and k of a source's shift, see `fluxes.py`."""
+    ratio = (shift[0] ** 2 + shift[1] ** 2) / (DOF * scatter**2)
+    return ratio, (DOF + 2.0) / (DOF * scatter**2 * (1.0 + ratio))
+
+
+@inner()
+def add_prior(h, group, prior, fluxes, shifts, share):
+    """Add the priors' curvature to H: a/F^2 for a flux, a share of k for a shift."""
+    size = 3 if prior.scatter > 0.0 else 1
     for i in range(group.lead.size):
-        flux = fluxes[group.members[i // size]]
-        h[group.start[i] + i] += shape / flux**2 if i % size == 0 else 1.0 / scatter**2
+        s = group.members[i // size]
+        if i % size == 0:
+            h[group.start[i] + i] += prior.shape / fluxes[s] ** 2
+        else:
+            h[group.start[i] + i] += share * shift_prior(shifts[s], prior.scatter)[1]
 
 
 @inner()

@@ -62,7 +62,7 @@ class Vectors(NamedTuple):
     """Parameter vectors as the loops need them, one row each."""
 
     theta: Floats  # (n, k)
-    nuisances: Floats  # (n, 5) in the order of SourceNuisances
+    nuisances: Floats  # (n, 6) in the order of SourceNuisances
     background: Floats  # (n, 6) coefficients of 1, u, v, u^2, uv, v^2; u, v from -1 to 1
 
 
@@ -147,5 +147,5 @@ class Turns(NamedTuple):
 def parameters_of(vectors, i):
     """Row i of the parameter vectors."""
     n = vectors.nuisances[i]
-    nuisances = SourceNuisances(n[0], n[1], n[2], n[3], n[4])
+    nuisances = SourceNuisances(n[0], n[1], n[2], n[3], n[4], n[5])
     return Parameters(vectors.theta[i], nuisances, vectors.background[i])

@@ -87,6 +87,6 @@ def log_likelihoods(problem, w, vectors, extrapolated, turns):
                 parameters = parameters_of(vectors, i)
                 value = render(problem, w, parameters).extra
                 if value > -math.inf:
-                    value += log_likelihood(problem.frame, w, parameters.background)
+                    value += log_likelihood(problem.frame, w, parameters)
                 clear(w)
             out[i] = value

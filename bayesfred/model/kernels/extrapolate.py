@@ -30,7 +30,7 @@ from bayesfred.model.kernels.clusters import bounding_boxes, cholesky, one_clust
 from bayesfred.model.kernels.contexts import Clusters
 from bayesfred.model.kernels.expansion import OVERLAP, own_run, pair, shared_run, single
 from bayesfred.model.kernels.likelihood import U, log_likelihood, mark, room, weigh_rows
-from bayesfred.model.kernels.noise_dispatch import at_level
+from bayesfred.model.kernels.noise_dispatch import given
 
 BAND = 16  # rows visited at a time
 VISITS = 3  # of all pixels, after which the fluxes count as not known beforehand
@@ -163,10 +163,10 @@ def _multiply_band(w, visit, top, last):
 
 
 @inner()
-def _sum_up(frame, w, background, visit, fluxes):
+def _sum_up(frame, w, parameters, visit, fluxes):
     """Render the sources with these fluxes and sum g and H, without the prior's share."""
     layout, boxes, place = visit.layout, visit.boxes, visit.templates.at
-    fp, noise = layout.footprints, at_level(frame.noise, background[0])
+    fp, noise = layout.footprints, given(frame.noise, parameters)
     visit.g[:] = 0.0
     expanded = np.any(visit.faint)
     visit.h[:] = 0.0
@@ -184,7 +184,7 @@ def _sum_up(frame, w, background, visit, fluxes):
                 place[i] = used + fp.start[i] - fp.start[p]
             used += fp.start[q] - fp.start[p]
             add_source(layout, s, (p, q), fluxes[s], visit.canvas, visit.templates)
-        weigh_rows(frame, noise, w, background, (top, last), expanded)
+        weigh_rows(frame, noise, w, parameters.background, (top, last), expanded)
         _multiply_band(w, visit, top, last)
 
 
@@ -263,11 +263,11 @@ def profile_extrapolated(problem, w, parameters, fluxes, known):
     for i in range(VISITS):
         if i > 0:
             w.image[:] = 0.0
-        _sum_up(frame, w, parameters.background, visit, fluxes)
+        _sum_up(frame, w, parameters, visit, fluxes)
         value, change = _newton(visit, clusters, problem.shape, scale, fluxes)
         if change < ENOUGH:
             value += _next_term(visit, problem.shape)
-            return value + log_likelihood(frame, w, parameters.background)
+            return value + log_likelihood(frame, w, parameters)
         if not (change < 0.5 * fluxes.size and np.min(fluxes) > 0.0):
             break
     return math.nan

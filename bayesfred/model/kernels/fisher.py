@@ -10,7 +10,17 @@ from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import SEGMENT, Layout
 from bayesfred.imaging.kernels.geometry import new_work, row_starts
 from bayesfred.imaging.kernels.jacobian import add_jacobian_rows
-from bayesfred.model.kernels.clusters import add_prior, cholesky, dot, gram, one_cluster, solve
+from bayesfred.model.kernels.clusters import (
+    DOF,
+    Prior,
+    add_prior,
+    cholesky,
+    dot,
+    gram,
+    one_cluster,
+    shift_prior,
+    solve,
+)
 from bayesfred.model.kernels.contexts import LIMIT
 from bayesfred.model.kernels.likelihood import (
     U,
@@ -20,13 +30,15 @@ from bayesfred.model.kernels.likelihood import (
     unreached_pixels,
 )
 from bayesfred.model.kernels.noise_dispatch import (
-    at_level,
+    error_information,
+    given,
     information,
     level_derivatives,
     unreached,
 )
 
 BAND = 16  # rows of the Jacobian held at a time
+EXPECTED = (DOF + 2.0) / (DOF + 4.0)
 
 
 class _Band(NamedTuple):
@@ -39,7 +51,11 @@ class _Band(NamedTuple):
 
 @inner()
 def _fill_weight(frame, noise, w, background):
-    """Expected information per marked pixel into w.weight, zero where masked."""
+    """Expected information per marked pixel into w.weight, zero where masked.
+
+    Returns the information about the model error.
+    """
+    known = 0.0
     pitch = frame.values.size // frame.ny
     for j in range(frame.ny):
         c0, c1, c2 = background_row(background, j, frame.ny)
@@ -49,8 +65,10 @@ def _fill_weight(frame, noise, w, background):
                 u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
                 mu = w.image[p] + c0 + u * (c1 + u * c2)
                 counted = frame.values[p] > LIMIT
-                w.weight[p] = information(noise, mu, U(p)) if counted else 0.0
+                w.weight[p] = information(noise, mu, w.image[p], U(p)) if counted else 0.0
+                known += error_information(noise, mu, w.image[p], U(p)) if counted else 0.0
             start, stop = next_run(w, j, stop)
+    return known
 
 
 @inner()
@@ -107,15 +125,18 @@ def _add_cross(w, band, profiled, cross):
 
 
 @inner()
-def _known_scatter(h, group, templates, scatter):
+def _known_scatter(h, group, profiled, templates, scatter):
     """Information about position_scatter from a cluster's sources."""
+    share = DOF / (DOF + 4.0)
     known, column = 0.0, np.empty(group.lead.size)
     for i in range(column.size):
         if i % templates > 0:
             column[:] = 0.0
             column[i] = 1.0
             solve(h, group, column)
-            known += 2.0 * (scatter**2 - column[i]) ** 2 / scatter**6
+            shift = profiled.shifts[group.members[i // templates]]
+            left = 1.0 - EXPECTED * shift_prior(shift, scatter)[1] * column[i]
+            known += share * 2.0 * (left / scatter) ** 2
     return known
 
 
@@ -132,9 +153,10 @@ def _subtract_profiled(w, rendered, profiled, scatter, cross, out):
             members, column = group.members, np.empty(group.lead.size)
             h = profiled.factors[clusters.begin[c] : clusters.begin[c + 1]]
             gram(touching, group, w.weight, at, h)
-            add_prior(h, group, templates, rendered.fluxes, profiled.shape, scatter)
+            prior = Prior(profiled.shape, scatter)
+            add_prior(h, group, prior, rendered.fluxes, profiled.shifts, EXPECTED)
             cholesky(h, group)  # positive definite: the prior's curvature is
-            known += _known_scatter(h, group, templates, scatter)
+            known += _known_scatter(h, group, profiled, templates, scatter)
             for m in range(out.shape[0]):
                 for i in range(column.size):
                     column[i] = cross[members[i // templates] * templates + i % templates, m]
@@ -153,17 +175,19 @@ def fisher(problem, w, rendered, parameters, basis, out):
     I = sum over pixels of J J^T / variance, band by band of rows; with free fluxes the Schur
     complement I - C H^-1 C^T over the sources' templates, where H carries the priors' curvature.
 
-    Returns the information about position_scatter: a coordinate measured with variance s^2 scatters
-    by tau^2 + s^2 about the catalogue's, which gives 2 tau^2 / (tau^2 + s^2)^2 = 2 (tau^2 - Q)^2 /
-    tau^6 with Q its variance given the prior. NaN where the likelihood is zero.
+    Returns the information about position_scatter and about model_error, NaN where the likelihood
+    is zero. A coordinate that is measured with variance s^2, and whose variance given the prior is
+    Q, tells of a normal scatter 2 tau^2 / (tau^2 + s^2)^2 = 2 (1 - Q / tau^2)^2 / tau^2. Student's
+    distribution gives nu / (nu + 4) of that, and on average (nu + 2) / (nu + 4) of the curvature k
+    as information about a shift.
     """
     o, frame, background = problem.optics, problem.frame, parameters.background
-    level, noise = background[0], at_level(frame.noise, background[0])
-    value = log_likelihood(frame, w, background)
+    level, noise = background[0], given(frame.noise, parameters)
+    value = log_likelihood(frame, w, parameters)
     if not rendered.extra + value > -math.inf:
-        return math.nan
+        return math.nan, math.nan
     profiled, scatter = rendered.profiled, parameters.nuisances.position_scatter
-    _fill_weight(frame, noise, w, background)
+    known_error = _fill_weight(frame, noise, w, background)
     sigma = parameters.nuisances.psf_sigma
     layout = Layout(o, rendered.geometry, rendered.footprints, sigma, new_work(o))
     sources, size = basis.row.size, out.shape[0]
@@ -182,4 +206,4 @@ def fisher(problem, w, rendered, parameters, basis, out):
     for k in range(size):
         for m in range(k):
             out[m, k] = out[k, m]
-    return known
+    return known, known_error

@@ -17,10 +17,15 @@ being F_s H_st F_t there,
 Laplace's approximation and the next term, see `expansion.py`.
 
 Free positions. Where the catalogue's positions scatter, every source has three free numbers phi =
-(F, dx, dy), the shifts dx and dy of a and b having the prior N(0, tau^2), and three templates T = d
-mu/d phi: K, F X and F Y with X = dK/d dx, Y = dK/d dy, rebuilt as the source moves. H = sum_p W T
-T^T + diag(a/F^2, 1/tau^2, 1/tau^2), W = -d^2 log L/d mu^2, leaves out the second derivatives, which
-it weighs with residuals of mean zero; that makes it positive definite anywhere.
+(F, dx, dy) and three templates T = d mu/d phi: K, F X and F Y with X = dK/d dx, Y = dK/d dy,
+rebuilt as the source moves. The shifts dx and dy of a and b have Student's t distribution with nu =
+`DOF` degrees of freedom as their prior, so that a few sources far off do not widen the others',
+
+    log p(dx, dy) = -(nu/2 + 1) log(1 + rho) - log(2 pi tau^2),    rho = (dx^2 + dy^2) / nu tau^2,
+
+whose derivative by dx is -k dx with k = (nu + 2) / nu tau^2 (1 + rho). H = sum_p W T T^T +
+diag(a/F^2, k, k), W = -d^2 log L/d mu^2, leaves out the second derivatives, which it weighs with
+residuals of mean zero, and that of k; that makes it positive definite anywhere.
 """
 
 import math
@@ -35,6 +40,8 @@ from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import move, row_starts
 from bayesfred.imaging.kernels.render import add_source, add_templates
 from bayesfred.model.kernels.clusters import (
+    DOF,
+    Prior,
     add_block,
     add_prior,
     add_template,
@@ -42,12 +49,13 @@ from bayesfred.model.kernels.clusters import (
     gram,
     one_cluster,
     project,
+    shift_prior,
     solve,
     squared,
 )
 from bayesfred.model.kernels.contexts import Group, Touching
 from bayesfred.model.kernels.expansion import Pixels, expand
-from bayesfred.model.kernels.noise_dispatch import at_level
+from bayesfred.model.kernels.noise_dispatch import exact_weight, given
 from bayesfred.model.kernels.patches import Patch, fill_excess, new_patch, weigh_patch
 
 
@@ -61,9 +69,8 @@ class _Cluster(NamedTuple):
     canvas: Canvas  # the patch's image
     fluxes: Floats
     shifts: Floats
-    shape: float  # of the fluxes' Gamma prior
-    scale: Floats  # and its scale, the catalogue's flux over the shape
-    scatter: float
+    prior: Prior
+    scale: Floats  # of the fluxes' Gamma prior, the catalogue's flux over the shape
 
 
 @inner()
@@ -107,9 +114,10 @@ def _fill_gradient(cluster, out):
         s, t = members[i // size], i % size
         out[i] = project(fp, s, stamps[t], cluster.patch.score, cluster.canvas.at)
         if t == 0:
-            out[i] += cluster.shape / cluster.fluxes[s] - 1.0 / cluster.scale[s]
+            out[i] += cluster.prior.shape / cluster.fluxes[s] - 1.0 / cluster.scale[s]
         else:
-            out[i] -= cluster.shifts[s, t - 1] / cluster.scatter**2
+            _, weight = shift_prior(cluster.shifts[s], cluster.prior.scatter)
+            out[i] -= weight * cluster.shifts[s, t - 1]
 
 
 @inner(fastmath=REDUCE, error_model="numpy")
@@ -179,18 +187,18 @@ def _take_step(cluster, step):
 
 
 @inner(error_model="numpy")
-def _maximize(frame, background, cluster, h):
+def _maximize(frame, parameters, cluster, h):
     """Newton's iteration for a cluster; leaves Cholesky's factor of H in h. False if it fails."""
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
-    size, noise = touching.stamps.shape[0], at_level(frame.noise, background[0])
+    size, noise = touching.stamps.shape[0], given(frame.noise, parameters)
     step, lower = np.empty(group.lead.size), h.copy() if size > 1 else h
     distance, rate, converged = 0.0, 1.0, False
     for _ in range(100):
-        weigh_patch(frame, noise, background, patch, None)
+        weigh_patch(frame, noise, parameters.background, patch, None)
         fresh = converged or rate > 0.01  # otherwise the last matrix serves
         if fresh:
             gram(touching, group, patch.weight, at, h)
-            add_prior(h, group, size, cluster.fluxes, cluster.shape, cluster.scatter)
+            add_prior(h, group, cluster.prior, cluster.fluxes, cluster.shifts, 1.0)
         if converged:
             return cholesky(h, group)
         _fill_gradient(cluster, step)
@@ -203,7 +211,7 @@ def _maximize(frame, background, cluster, h):
         # Newton step of fluxes alone the square of the largest relative change.
         before, distance = distance, np.dot(gradient, step)
         rate = distance / before if before > 0.0 else 1.0
-        if fresh and size == 1:
+        if fresh and size == 1 and exact_weight(noise):
             rate = largest * largest
         converged = distance * min(rate, 1.0) <= 1e-16
     return False
@@ -229,14 +237,14 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
         patch = new_patch(w, touching, group, at)
         canvas = Canvas(patch.image, at)
         cluster = _Cluster(
-            layout, touching, group, patch, canvas, fluxes, shifts, shape, scale, scatter
+            layout, touching, group, patch, canvas, fluxes, shifts, Prior(shape, scatter), scale
         )
         fill_excess(problem.frame, parameters.background, patch)
         _start(cluster)
-        if not _maximize(problem.frame, parameters.background, cluster, h):
+        if not _maximize(problem.frame, parameters, cluster, h):
             return -math.inf
         if np.any(touching.faint[group.members]):
-            noise = at_level(problem.frame.noise, parameters.background[0])
+            noise = given(problem.frame.noise, parameters)
             weigh_patch(problem.frame, noise, parameters.background, patch, patch.ratio)
             pixels = Pixels(patch.weight, patch.ratio, at)
             value += expand(touching, group, fluxes, shape, pixels)[0]
@@ -246,7 +254,7 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
             value += (shape - 1.0) * math.log(fluxes[s] / scale[s]) - fluxes[s] / scale[s]
             value += constant - math.log(scale[s])
             if size > 1:
-                square = shifts[s, 0] ** 2 + shifts[s, 1] ** 2
-                value -= 0.5 * square / scatter**2 + 2.0 * math.log(scatter)
+                ratio, _ = shift_prior(shifts[s], scatter)
+                value -= (0.5 * DOF + 1.0) * math.log1p(ratio) + 2.0 * math.log(scatter)
             add_template(fp, s, touching.stamps[0], fluxes[s], Canvas(w.image, frame))
     return value

@@ -24,7 +24,15 @@ e_dy likewise. Every source gives d log L the terms c_0 dK + c_1 dX + c_2 dY,
 
     c_0 = F A + z_0 r - W q_0,   c_1 = F (z_1 r - W q_1),   c_2 = F (z_2 r - W q_2),
 
-and d log L/d tau = sum_s [(dx^2 + dy^2 + Q_11 + Q_22 + 2 z_1 dx + 2 z_2 dy)/tau^3 - 2/tau].
+With the k and rho of `fluxes.py`, G has k - 2 k dx^2 / nu tau^2 (1 + rho) and so on for the prior,
+e_dx gains (Q_11 + Q_22) k dx / nu tau^2 (1 + rho), and
+
+    d log L/d tau = sum_s [k (dx^2 + dy^2) + (Q_11 + Q_22 + 2 z_1 dx + 2 z_2 dy) k / (1 + rho) -
+                    2] / tau.
+
+Model error. The weight W of `model_error.py` is not -dr/dmu, which then replaces it in G and in W
+y; and a change of the background is not that of the light. So the derivatives in the background and
+the model error have an A of their own, of the derivatives of log L, W and r by these.
 """
 
 import math
@@ -39,25 +47,32 @@ from bayesfred.imaging.kernels.geometry import new_work, one_source, row_starts
 from bayesfred.imaging.kernels.jacobian import PixelGrid, Rows, basis_row, new_rows, pixel_grid
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.clusters import (
+    DOF,
+    Prior,
     add_block,
     add_prior,
     add_template,
     cholesky,
     gram,
     one_cluster,
+    shift_prior,
     solve,
     touch,
 )
 from bayesfred.model.kernels.contexts import LIMIT, Touching
 from bayesfred.model.kernels.expansion import Pixels, add_slopes, expand
 from bayesfred.model.kernels.likelihood import (
+    U,
+    background_row,
     log_likelihood,
     next_run,
     unreached_pixels,
     weigh_rows,
 )
 from bayesfred.model.kernels.noise_dispatch import (
-    at_level,
+    error_slopes,
+    exact_weight,
+    given,
     level_derivatives,
     unreached,
 )
@@ -82,6 +97,7 @@ class _Adjoint(NamedTuple):
     fluxes: Floats
     score: Floats
     weight: Floats
+    response: Floats  # -dr/dmu
     at: Ints  # where the footprints' rows begin in the padded frame
     mixed: Floats  # the templates q = Q T
     light: Floats  # (samples,) dc/dT over W
@@ -193,21 +209,27 @@ def _fill_part(adjoint, group, shape, ratio, h, part):
 
 
 @inner()
-def _hessian(adjoint, group, prior, part, lower):
+def _hessian(adjoint, group, prior, shifts, part, lower):
     """Cholesky's factor of G; it is positive definite at a maximum, elsewhere H has to do."""
     size, g = adjoint.mixed.shape[0], np.empty(lower.size)
-    gram(adjoint.touching, group, adjoint.weight, adjoint.at, g)
-    add_prior(g, group, size, adjoint.fluxes, prior[0], prior[1])
-    for i in range(group.members.size):
+    gram(adjoint.touching, group, adjoint.response, adjoint.at, g)
+    add_prior(g, group, prior, adjoint.fluxes, shifts, 1.0)
+    for i in range(group.members.size if size > 1 else 0):
         _second_derivatives(adjoint, group, i, part[i * size : (i + 1) * size], g)
+        shift = shifts[group.members[i]]
+        ratio, k = shift_prior(shift, prior.scatter)
+        c = -2.0 * k / (DOF * prior.scatter**2 * (1.0 + ratio))
+        xx, xy, yy = c * shift[0] ** 2, c * shift[0] * shift[1], c * shift[1] ** 2
+        add_block(i, group.start, g, (0.0, 0.0, xx, xy, yy))
     return g if cholesky(g, group) else lower
 
 
 @inner()
-def _laplace_adjoint(w, layout, rendered, profiled, scatter):
-    """z, the templates q, the image A and the derivative by tau of the module's derivation."""
+def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
+    """z, the templates q, the images h and y and the derivative by tau of the derivation."""
     if profiled is None:
-        return np.zeros((rendered.fluxes.size, 1)), np.empty((1, 0)), w.score, 0.0
+        none = np.empty(0)
+        return np.zeros((rendered.fluxes.size, 1)), np.empty((1, 0)), none, none, 0.0
     touching, flux, shift = profiled.touching, rendered.fluxes, profiled.shifts
     shape = profiled.shape
     fp, clusters, stamps = touching.footprints, touching.clusters, touching.stamps
@@ -216,9 +238,11 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter):
     at, mixed = row_starts(fp, pitch), np.zeros(stamps.shape)
     rows = new_rows(layout, _constants(), pitch)
     grid, light = pixel_grid(layout), np.zeros(stamps.shape[1])
+    curve = w.weight if response.size == 0 else response
     adjoint = _Adjoint(
-        layout.geometry, grid, touching, flux, w.score, w.weight, at, mixed, light, rows
+        layout.geometry, grid, touching, flux, w.score, w.weight, curve, at, mixed, light, rows
     )
+    prior = Prior(shape, scatter if size > 1 else 0.0)
     slope = 0.0
     for c in range(clusters.first.size - 1):
         group = one_cluster(clusters, c, size)
@@ -229,21 +253,74 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter):
         for i in range(0, part.size, size):
             own = flux[group.members[i // size]]
             part[i] += shape * diagonal[i] / own**3 - 1.0 / own
-        if size > 1:
-            lower = _hessian(adjoint, group, (shape, scatter), part, lower)
+            if size > 1:
+                ratio, k = shift_prior(shift[group.members[i // size]], scatter)
+                more = (diagonal[i + 1] + diagonal[i + 2]) * k / (DOF * scatter**2 * (1.0 + ratio))
+                part[i + 1] += more * shift[group.members[i // size], 0]
+                part[i + 2] += more * shift[group.members[i // size], 1]
+        if size > 1 or response.size > 0:
+            lower = _hessian(adjoint, group, prior, shift, part, lower)
         solve(lower, group, part)
         for i in range(part.size):
             s, t = group.members[i // size], i % size
             z[s, t] = part[i]
             add_template(fp, s, stamps[t], part[i], Canvas(y, at))
             if t > 0:
-                d = shift[s, t - 1]
-                slope += (d * d + diagonal[i] + 2.0 * part[i] * d) / scatter**3 - 1.0 / scatter
-    for k in range(w.flags.size):
-        if w.flags[k] != 0:
-            for p in range(k * SEGMENT, (k + 1) * SEGMENT):
-                h[p] = w.score[p] + w.weight[p] * (w.ratio[p] * h[p] - y[p])
-    return z, mixed, h, slope
+                d, (ratio, k) = shift[s, t - 1], shift_prior(shift[s], scatter)
+                moved = (diagonal[i] + 2.0 * part[i] * d) / (1.0 + ratio)
+                slope += (k * (d * d + moved) - 1.0) / scatter
+    return z, mixed, h, y, slope
+
+
+@inner()
+def _responses(frame, noise, w, background):
+    """-dr/dmu of the marked pixels where the weight is not that."""
+    if exact_weight(noise):
+        return np.empty(0)
+    out, pitch = np.zeros(w.image.size), w.image.size // frame.ny
+    for j in range(frame.ny):
+        c0, c1, c2 = background_row(background, j, frame.ny)
+        start, stop = next_run(w, j, w.span[j, 0])
+        while start >= 0:
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                if frame.values[p] > LIMIT:
+                    u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
+                    mu = w.image[p] + c0 + u * (c1 + u * c2)
+                    out[p] = -error_slopes(noise, frame.values[p], mu, w.image[p], U(p))[0]
+            start, stop = next_run(w, j, stop)
+    return out
+
+
+@inner()
+def _images(frame, noise, w, background, h, y):
+    """A of the light and of the background, and the sum that is the slope by the model error."""
+    profiled = h.size > 0
+    if exact_weight(noise):
+        if not profiled:
+            return w.score, w.score, 0.0
+        for k in range(w.flags.size):
+            if w.flags[k] != 0:
+                for p in range(k * SEGMENT, (k + 1) * SEGMENT):
+                    h[p] = w.score[p] + w.weight[p] * (w.ratio[p] * h[p] - y[p])
+        return h, h, 0.0
+    light, level, slope = w.score.copy(), np.zeros(w.image.size), 0.0
+    pitch = w.image.size // frame.ny
+    for j in range(frame.ny):
+        c0, c1, c2 = background_row(background, j, frame.ny)
+        start, stop = next_run(w, j, w.span[j, 0])
+        while start >= 0:
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                if frame.values[p] > LIMIT:
+                    u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
+                    mu = w.image[p] + c0 + u * (c1 + u * c2)
+                    by = error_slopes(noise, frame.values[p], mu, w.image[p], U(p))
+                    a, b = (h[p], y[p]) if profiled else (0.0, 0.0)
+                    curve = w.weight[p] * w.ratio[p] * a if profiled else 0.0
+                    light[p] += curve + by[0] * b
+                    level[p] = by[1] + by[2] * a + by[3] * b
+                    slope += by[4] + by[5] * a + by[6] * b
+            start, stop = next_run(w, j, stop)
+    return light, level, slope
 
 
 @inner()
@@ -288,19 +365,24 @@ def gradient(problem, w, rendered, parameters, basis, out):
     """Exact gradient of the log-likelihood.
 
     `out` are two arrays: for the source parameters and the background coefficients. Returns the
-    derivative with respect to position_scatter, NaN where the likelihood is zero, and z.
+    derivatives with respect to position_scatter and model_error, NaN where the likelihood is zero,
+    and z.
     """
     o, frame, background = problem.optics, problem.frame, parameters.background
-    level, noise = background[0], at_level(frame.noise, background[0])
-    value = log_likelihood(frame, w, background)
+    level, noise = background[0], given(frame.noise, parameters)
+    value = log_likelihood(frame, w, parameters)
     if not rendered.extra + value > -math.inf:
-        return math.nan, np.empty((0, 0))
+        return (math.nan, math.nan), np.empty((0, 0))
     fp, pitch = rendered.footprints, w.image.size // o.ny
     layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
     weigh_rows(frame, noise, w, background, (0, o.ny), rendered.profiled is not None)
     scatter = parameters.nuisances.position_scatter
-    z, mixed, image, slope = _laplace_adjoint(w, layout, rendered, rendered.profiled, scatter)
-    _add_background(frame, w, image, out[1])
+    response = _responses(frame, noise, w, background)
+    z, mixed, h, y, slope = _laplace_adjoint(
+        w, layout, rendered, rendered.profiled, scatter, response
+    )
+    image, below, by_error = _images(frame, noise, w, background, h, y)
+    _add_background(frame, w, below, out[1])
     out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]
     out[1][0] += level_derivatives(frame.noise, frame.pixels, level, value)[0]
     most = 0
@@ -315,4 +397,4 @@ def gradient(problem, w, rendered, parameters, basis, out):
             add_basis_sums(layout, basis, s, t, weights, sums)
         for k in range(basis.row.size):
             out[0][k] += basis.factors[s, k] * sums.out[basis.row[k]]
-    return slope, z
+    return (slope, by_error), z

@@ -16,7 +16,7 @@ from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
 from bayesfred.model.kernels.contexts import LIMIT, Unreached, Workspace
-from bayesfred.model.kernels.noise_dispatch import at_level, derivatives, summed, unreached
+from bayesfred.model.kernels.noise_dispatch import derivatives, given, summed, unreached
 
 LEAST = 1e-200  # weight of a pixel that tells anything
 U = np.uint64  # an index that has no sign need not be compared with zero
@@ -165,7 +165,7 @@ def weigh_run(noise, part, score, weight, ratio):
         x = u + step * i
         mu = image[i] + (c0 + x * (c1 + x * c2))
         counted = values[i] > LIMIT
-        s, w, c = derivatives(noise, values[i] if counted else mu, mu, U(first + i))
+        s, w, c = derivatives(noise, values[i] if counted else mu, mu, image[i], U(first + i))
         score[i], weight[i] = s if counted else 0.0, w if counted else 0.0
         if ratio is not None:
             ratio[i] = c / w if counted and w > LEAST else 0.0
@@ -218,24 +218,26 @@ def unreached_pixels(frame, w):
 
 
 @inner()
-def log_likelihood(frame, w, background):
+def log_likelihood(frame, w, parameters):
     """Log-likelihood of the workspace's image plus the background.
 
     What depends on the counts alone is left out.
     """
-    noise, level = at_level(frame.noise, background[0]), background[0]
+    noise, background = given(frame.noise, parameters), parameters.background
+    level = background[0]
     pitch = frame.values.size // frame.ny
     total = 0.0
     for j in range(frame.ny):
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             a, b = j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT
-            image = w.image[a:b]
+            light = w.image[a:b]
+            image = light
             if frame.varies:
-                part = stretch(frame, background, j, a, image)
+                part = stretch(frame, background, j, a, light)
                 level, image = part.c0, w.score[a:b]
                 _slope_run(part, image)
-            total += summed(noise, frame.values[a:b], image, level, a)
+            total += summed(noise, frame.values[a:b], light, image, level, a)
             start, stop = next_run(w, j, stop)
     rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
     return -math.inf if total + rest < LIMIT else total + rest

@@ -1,19 +1,22 @@
 """What the loops ask of a noise model, answered at compile time by its type.
 
 The compiled half of a noise model is a named tuple class. Its fields are numbers and arrays; its
-static methods are compiled into the loops. n are counts and mu is their mean. p is the pixel's
-place in the frame's padded, flattened rows. A model has
+static methods are compiled into the loops. n are counts, mu is their mean, and light is the part of
+the mean that comes from sources. p is the pixel's place in the frame's padded, flattened rows. A
+model has
 
-    log_density(noise, n, mu, p)      log-density, up to what depends on the counts alone; MASKED
+    log_density(noise, n, mu, light, p)
+                                      log-density, up to what depends on the counts alone; MASKED
                                       or less where mu is impossible
-    derivatives(noise, n, mu, p)      s = d log_density / d mu, W = -ds / d mu, C = -1/2 dW / d mu
-    information(noise, mu, p)         the expectation of W
+    derivatives(noise, n, mu, light, p)
+                                      s = d log_density / d mu, W = -ds / d mu, C = -1/2 dW / d mu
+    information(noise, mu, light, p)  the expectation of W
 
 These see a pixel outside the likelihood, too, as one with n = mu; what they return for it is not
 used. They must not branch where a loop shall vectorise. A model may have its own way to sum over
 whole segments of a row, the mean being image + level:
 
-    summed(noise, values, image, level, first)
+    summed(noise, values, light, image, level, first)
                                       the sum of log_density; the first pixel's place is `first`
 
 Where the background is constant, it may spare the loops the pixels that no source reaches:
@@ -21,9 +24,13 @@ Where the background is constant, it may spare the loops the pixels that no sour
     unreached(noise, rest, level)     the sum of log_density over them, its derivative in the level,
                                       and the sum of information; `rest` is an `Unreached`
 
-A model that depends on the constant background beyond the mean has
+A model that admits a model error, see `model_error.py`, has
 
-    at_level(noise, level)            the model for this level, itself a noise's compiled half
+    spread(noise, mu, p)              the variance of the counts and its derivative in mu
+
+A model that depends on parameters beyond the mean has
+
+    given(noise, parameters)          the model for these, itself a noise's compiled half
     level_derivatives(noise, pixels, level, value)
                                       what that adds to the derivative of the log-likelihood, whose
                                       value is given, and to the information
@@ -44,7 +51,7 @@ def _optional(name: str, default: Callable[..., Any]) -> Callable[..., Any]:
     return by_type(lambda family: getattr(family, name, default))
 
 
-def _same(noise, level):
+def _same(noise, parameters):
     return noise
 
 
@@ -63,21 +70,39 @@ unreached = _optional("unreached", _no_pixels)
 
 
 @inner(fastmath=REDUCE, error_model="numpy")
-def sum_pixels(noise, values, image, level, first):
+def sum_pixels(noise, values, light, image, level, first):
     """Sum of the log-densities of the unmasked pixels of a stretch, one by one."""
     total = 0.0
     for i in range(image.size):
         mu = image[i] + level
         counted = values[i] > LIMIT
-        term = log_density(noise, values[i] if counted else mu, mu, np.uint64(first + i))
+        n = values[i] if counted else mu
+        term = log_density(noise, n, mu, light[i], np.uint64(first + i))
         total += term if counted else 0.0
     return total
 
 
-def _pixel_by_pixel(noise, values, image, level, first):
-    return sum_pixels(noise, values, image, level, first)
+def _pixel_by_pixel(noise, values, light, image, level, first):
+    return sum_pixels(noise, values, light, image, level, first)
+
+
+def _exact(noise):
+    return True
+
+
+def _no_slopes(noise, n, mu, light, p):
+    return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+def _no_information(noise, mu, light, p):
+    return 0.0
 
 
 summed = _optional("summed", _pixel_by_pixel)
-at_level = _optional("at_level", _same)
+spread = by_type(lambda family: family.spread)
+given = _optional("given", _same)
+# What a model error adds, see `model_error.py`.
+exact_weight = _optional("exact_weight", _exact)
+error_slopes = _optional("error_slopes", _no_slopes)
+error_information = _optional("error_information", _no_information)
 level_derivatives = _optional("level_derivatives", _no_derivatives)

@@ -65,24 +65,29 @@ class ReadNoiseTerms(NamedTuple):
     cumulants: CumulantTable | None  # of a frame with one read noise
 
     @staticmethod
-    def log_density(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         """log p less what depends on n alone."""
         return density_of(noise.kind, n, mu, _at(noise.variance, p)) if mu >= 0.0 else MASKED
 
     @staticmethod
-    def summed(noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
+    def summed(noise: Any, values: Any, light: Any, image: Any, level: Any, first: Any) -> Any:
         """Sum of log_density over segments."""
         return _sum_up(noise.cumulants, noise, values, image, level, first)
 
     @staticmethod
-    def derivatives(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         """Score, weight and C."""
         return derivatives_of(noise.kind, n, mu, _at(noise.variance, p))
 
     @staticmethod
-    def information(noise: Any, mu: Any, p: Any) -> Any:
+    def information(noise: Any, mu: Any, light: Any, p: Any) -> Any:
         """The expectation of the weight."""
         return _information(noise, mu, _at(noise.variance, p), _at(noise.row, p))
+
+    @staticmethod
+    def spread(noise: Any, mu: Any, p: Any) -> Any:
+        """Variance of the counts, and its slope."""
+        return max(mu, 0.0) + _at(noise.variance, p), 1.0
 
     @staticmethod
     def unreached(noise: Any, rest: Any, level: Any) -> Any:
@@ -126,7 +131,7 @@ def _sum_segments(noise, values, image, level, first):
         if served:
             total += _sum_tabulated(noise, values[a:b], image[a:b], level)
         else:
-            total += sum_pixels(noise, values[a:b], image[a:b], level, first + a)
+            total += sum_pixels(noise, values[a:b], image[a:b], image[a:b], level, first + a)
     return total
 
 
@@ -138,7 +143,7 @@ def _sum_up(table: Any, noise: Any, values: Any, image: Any, level: Any, first: 
 def _choose_sum(table: Any, noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
     if isinstance(table, types.NoneType):
         return lambda table, noise, values, image, level, first: sum_pixels(
-            noise, values, image, level, first
+            noise, values, image, image, level, first
         )
     return lambda table, noise, values, image, level, first: _sum_segments(
         noise, values, image, level, first
@@ -215,7 +220,7 @@ def _segment_density(noise, values, level, first):
     for i in range(values.size):
         counted = values[i] > LIMIT
         n = values[i] if counted else level
-        term = log_density(noise, n, level, np.uint64(first + i))
+        term = log_density(noise, n, level, 0.0, np.uint64(first + i))
         total += term if counted else 0.0
     return total
 
@@ -226,7 +231,7 @@ def _segment_score(noise, values, level, first):
     for i in range(values.size):
         counted = values[i] > LIMIT
         n = values[i] if counted else level
-        term = derivatives(noise, n, level, np.uint64(first + i))[0]
+        term = derivatives(noise, n, level, 0.0, np.uint64(first + i))[0]
         total += term if counted else 0.0
     return total
 
@@ -236,7 +241,7 @@ def _segment_information(noise, values, level, first):
     total = 0.0
     for i in range(values.size):
         if values[i] > LIMIT:
-            total += information(noise, level, np.uint64(first + i))
+            total += information(noise, level, 0.0, np.uint64(first + i))
     return total
 
 
@@ -269,21 +274,21 @@ def _segment_sums(noise, values, level, informed, out):
 def log_densities(noise, n, mu, out):
     """Log-densities of pixels, less what depends on the counts alone."""
     for i in range(out.size):
-        out[i] = log_density(noise, n[i], mu[i], np.uint64(i))
+        out[i] = log_density(noise, n[i], mu[i], 0.0, np.uint64(i))
 
 
 @entry(fastmath=FAST, error_model="numpy")
 def scores(noise, n, mu, out):
     """Derivatives of the log-densities by mu."""
     for i in range(out.size):
-        out[i] = derivatives(noise, n[i], mu[i], np.uint64(i))[0]
+        out[i] = derivatives(noise, n[i], mu[i], 0.0, np.uint64(i))[0]
 
 
 @entry()
 def informations(noise, mu, out):
     """Expected information of pixels."""
     for i in range(out.size):
-        out[i] = information(noise, mu[i], np.uint64(i))
+        out[i] = information(noise, mu[i], 0.0, np.uint64(i))
 
 
 @entry()
@@ -296,7 +301,7 @@ def most_likely(noise, n, out):
     for i in range(out.size):
         mu = max(n[i], 1e-3)
         for _ in range(200):
-            s, w, _ = derivatives(noise, n[i], mu, np.uint64(i))
+            s, w, _ = derivatives(noise, n[i], mu, 0.0, np.uint64(i))
             before, mu = mu, max(mu + s / w, 0.1 * mu) if w > 0.0 else 0.1 * mu
             if mu < 1e-25 or abs(mu - before) <= 1e-9 * mu:
                 break

@@ -4,6 +4,7 @@
 """
 
 from bayesfred.model.noise.gaussian import BackgroundNoise, GaussianNoise
+from bayesfred.model.noise.model_error import ModelErrorNoise, model_error_terms
 from bayesfred.model.noise.poisson import PoissonNoise
 from bayesfred.model.noise.protocol import Noise
 from bayesfred.model.noise.simulation import simulate
@@ -11,7 +12,9 @@ from bayesfred.model.noise.simulation import simulate
 __all__ = [
     "BackgroundNoise",
     "GaussianNoise",
+    "ModelErrorNoise",
     "Noise",
     "PoissonNoise",
+    "model_error_terms",
     "simulate",
 ]

@@ -35,18 +35,22 @@ class GaussianTerms(NamedTuple):
     sums: Floats  # (3, segments) of w, w n and w n^2
 
     @staticmethod
-    def log_density(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         r = n - mu
         return noise.norm - 0.5 * noise.scale * _weight(noise.weights, p) * (r * r)
 
     @staticmethod
-    def derivatives(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         w = noise.scale * _weight(noise.weights, p)
         return w * (n - mu), w, 0.0
 
     @staticmethod
-    def information(noise: Any, mu: Any, p: Any) -> Any:
+    def information(noise: Any, mu: Any, light: Any, p: Any) -> Any:
         return noise.scale * _weight(noise.weights, p)
+
+    @staticmethod
+    def spread(noise: Any, mu: Any, p: Any) -> Any:
+        return 1.0 / (noise.scale * _weight(noise.weights, p)), 0.0
 
     @staticmethod
     def unreached(noise: Any, rest: Any, level: Any) -> Any:
@@ -68,7 +72,8 @@ class BackgroundTerms(NamedTuple):
     sums: Floats
 
     @staticmethod
-    def at_level(noise: Any, level: Any) -> Any:
+    def given(noise: Any, parameters: Any) -> Any:
+        level = parameters.background[0]
         scale = 1.0 / level if level > 0.0 else 1.0
         norm = 0.5 * math.log(scale / (2.0 * math.pi)) if level > 0.0 else MASKED
         return GaussianTerms(scale, norm, None, noise.sums)
@@ -166,6 +171,12 @@ class GaussianNoise(_Gaussian):
                 f"noise: variance: got shape {np.shape(self.variance)}, expected a number or the "
                 f"frame's shape {counts.shape}"
             )
+
+    def highest(self, counts: Floats) -> Floats:
+        norm = -0.5 * math.log(2.0 * math.pi)
+        if isinstance(self.variance, float):
+            norm -= 0.5 * math.log(self.variance)
+        return np.full(counts.shape, norm)
 
     def at(self, pixels: Any) -> "GaussianNoise":
         if isinstance(self.variance, float):

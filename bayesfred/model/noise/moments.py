@@ -200,6 +200,15 @@ def information(mean: Floats, read_noise: float | Floats) -> Floats:
     return out
 
 
+def highest_density(counts: Floats, read_noise: float | Floats) -> Floats:
+    """Supremum over the mean of the log-density, less what depends on the counts alone."""
+    n, _, r, out = _alike(counts, counts, read_noise)
+    terms, best = _quadrature_terms(r), np.empty(n.size)
+    most_likely(terms, n, best)
+    log_densities(terms, n, best, out.ravel())
+    return out
+
+
 def deviance(counts: Floats, mean: Floats, read_noise: float | Floats) -> Floats:
     """Unit deviance, finite for any counts."""
     n, mu, r, out = _alike(counts, mean, read_noise)

@@ -20,6 +20,7 @@ from bayesfred.model.kernels.read_noise import ReadNoiseTerms
 from bayesfred.model.noise.moments import (
     deviance,
     frame_terms,
+    highest_density,
     information,
     log_likelihood,
     moment_table,
@@ -41,19 +42,23 @@ class PoissonTerms(NamedTuple):
     """n log(mu) - mu, see `model/kernels/noise_dispatch`."""
 
     @staticmethod
-    def log_density(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         # neither a branch nor a minimum: the loop would not vectorise
         return n * log(mu) - mu if mu > 0.0 else MASKED
 
     @staticmethod
-    def derivatives(noise: Any, n: Any, mu: Any, p: Any) -> Any:
+    def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         inverse = 1.0 / max(mu, NOTHING)
         score = n * inverse
         return score - 1.0, score * inverse, score * inverse * inverse
 
     @staticmethod
-    def information(noise: Any, mu: Any, p: Any) -> Any:
+    def information(noise: Any, mu: Any, light: Any, p: Any) -> Any:
         return 1.0 / max(mu, NOTHING)
+
+    @staticmethod
+    def spread(noise: Any, mu: Any, p: Any) -> Any:
+        return max(mu, NOTHING), 1.0
 
     @staticmethod
     def unreached(noise: Any, rest: Any, level: Any) -> Any:
@@ -171,6 +176,11 @@ class PoissonNoise(Noise):
         if isinstance(self.read_noise, float):
             return self
         return PoissonNoise(self.read_noise[pixels])
+
+    def highest(self, counts: Floats) -> Floats:
+        if not self.discrete:
+            return highest_density(counts, self.read_noise)
+        return np.asarray(xlogy(counts, np.maximum(counts, NOTHING)) - counts)
 
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
         counts = rng.poisson(sources + background).astype(np.float64)

@@ -40,10 +40,18 @@ class Noise(Protocol):
 
     def check(self, counts: Floats, used: Flags, flux: str, background_order: int) -> None:
         """Raise InputError if the model explains no such counts, or admits no such nuisances."""
+        return
 
     def at(self, pixels: Any) -> Self:
         """The noise of the pixels that an index selects."""
         return self
+
+    def highest(self, counts: Floats) -> Floats | None:
+        """Supremum over the mean of the compiled log-density, for the counts of every pixel.
+
+        None where the model admits no model error.
+        """
+        return None
 
     @abstractmethod
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
