@@ -98,9 +98,9 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     posterior, named = scattered(model, tau, rng, background, noise, mask=mask)
     params = at_random(posterior, named, rng)
     scale = errors(posterior, params)
-    numerical = [
-        five_point(posterior.log_prob, params, k, STEP * scale[k]) for k in range(params.size)
-    ]
+    steps = STEP * scale
+    steps[posterior.parameter_names.index("position_scatter")] *= 0.1  # of faint sources: far bent
+    numerical = [five_point(posterior.log_prob, params, k, steps[k]) for k in range(params.size)]
     assert posterior.gradient(params) * scale == pytest.approx(
         np.array(numerical) * scale, rel=1e-6, abs=1e-6
     )
@@ -147,7 +147,7 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     square = np.repeat(np.sum(phi[n:].reshape(n, 2) ** 2, axis=1), 2)
     curvature = (DOF + 2) / (DOF * tau**2 + square)  # slope of log prior over the shift
     h = (slopes * posterior.counts.ravel() / mean(phi) ** 2) @ slopes.T + np.diag(
-        np.append(2 * phi[:n] ** -2, curvature)
+        np.append(2 * phi[:n] ** -2, DOF / (DOF + 2) * curvature)
     )
     expected = value(found.x) + 1.5 * n * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(h)[1]
     expected -= found.x[:n].sum()  # the density is that of log F, H that in F
@@ -243,9 +243,10 @@ def test_errors_hold_where_positions_scatter() -> None:
     squares: dict[bool, list[float]] = {True: [], False: []}
     found = []
     for frame in range(FRAMES):
+        scale = tau * np.sqrt(DOF / rng.chisquare(DOF, 25))
         moved = SourceCatalog(
-            grid.x + tau * rng.standard_normal(25),
-            grid.y + tau * rng.standard_normal(25),
+            grid.x + scale * rng.standard_normal(25),
+            grid.y + scale * rng.standard_normal(25),
             grid.flux,
         )
         counts = simulate(model(moved), theta, 2.0, seed=frame)
@@ -259,15 +260,57 @@ def test_errors_hold_where_positions_scatter() -> None:
             if scatter:
                 found.append(estimate.params[posterior.parameter_names.index("position_scatter")])
     # 144 pulls: their mean square is 1 but for a Monte Carlo error of sqrt(2 / 144); the scatter,
-    # known to 10 % from 50 coordinates, makes them Student's t with about 50 degrees of freedom,
-    # whose variance is 50 / 48
+    # known to 15 % from 25 sources, makes them Student's t with about 20 degrees of freedom, whose
+    # variance is 10 / 9
     error = math.sqrt(2 / (6 * FRAMES))
-    assert abs(np.mean(squares[True]) - 50 / 48) < LIMIT * error
-    assert abs(np.mean(found) / tau - 1) < 0.03 + LIMIT * 0.1 / math.sqrt(
-        FRAMES
-    )  # its maximum is biased by some 1 / 50
+    assert abs(np.mean(squares[True]) - 10 / 9) < LIMIT * error
+    # its maximum is biased by some 1 / 25
+    assert abs(np.mean(found) / tau - 1) < 0.05 + LIMIT * 0.15 / math.sqrt(FRAMES)
     # negative control: photon noise alone does not explain the errors
     assert np.mean(squares[False]) > 1 + 10 * LIMIT * error
+
+
+def displaced(frames: int, outliers: int, seed: int) -> dict[bool, tuple[Floats, Floats]]:
+    """Pulls of six coefficients and their widths, with and without a scatter in the fit, from
+    frames of 49 stars of which some are a pixel off the catalogue."""
+    rng, grid = np.random.default_rng(seed), SourceCatalog.grid(7, 17.3, 2e4)
+    terms = PolynomialDistortion(
+        [(1, 0, 0, 0), (3, 0, 0, 0), (1, 2, 0, 0)], [(0, 1, 0, 0), (2, 1, 0, 0), (0, 3, 0, 0)]
+    )
+    theta = np.array([1e-3, 1e-6, -1e-6, -1e-3, 2e-6, 1e-6])
+
+    def model(catalogue: SourceCatalog) -> ForwardModel:
+        return ForwardModel(Detector((128, 128)), catalogue, GaussianPSF(1.5), terms)
+
+    found: dict[bool, list[tuple[Floats, Floats]]] = {True: [], False: []}
+    for _ in range(frames):
+        angle, off = rng.uniform(0.0, 2.0 * np.pi, 49), np.zeros(49)
+        off[rng.choice(49, outliers, replace=False)] = 1.0
+        moved = SourceCatalog(grid.x + off * np.cos(angle), grid.y + off * np.sin(angle), grid.flux)
+        counts = simulate(model(moved), theta, 20.0, seed=int(rng.integers(2**31)))
+        for scatter in (True, False):
+            nuisances = Nuisances("free", offset=True, position_scatter=scatter)
+            best = find_map(Posterior(model(grid), counts, nuisances=nuisances))
+            sd = np.sqrt(np.diag(best.covariance))[:6]
+            found[scatter].append(((best.params[:6] - theta) / sd, sd))
+    return {k: (np.array([a for a, _ in v]), np.array([b for _, b in v])) for k, v in found.items()}
+
+
+@pytest.mark.statistics
+def test_errors_hold_where_two_stars_of_many_are_displaced() -> None:
+    found = displaced(100, 2, 54)
+    z = np.abs(found[True][0])
+    # 600 pulls: 1.9 % and 0.9 %
+    assert np.mean(z < 1.0) == pytest.approx(0.683, abs=0.05)
+    assert np.mean(z < 1.96) == pytest.approx(0.95, abs=0.03)
+    assert np.mean(np.abs(found[False][0]) < 1.0) < 0.3  # negative control: exact positions
+
+
+@pytest.mark.statistics
+def test_heavy_tails_cost_little_where_positions_are_exact() -> None:
+    found = displaced(20, 0, 55)
+    assert np.mean(found[True][1] / found[False][1]) < 1.2
+    assert np.mean(np.abs(found[True][0]) < 1.0) > 0.6
 
 
 @pytest.mark.parametrize("radius", [8.0, 11.0, 14.0, 17.0])

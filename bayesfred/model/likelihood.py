@@ -248,12 +248,11 @@ class FrameLikelihood:
 
     def noise_at(self, params: Floats) -> Noise:
         """The noise with the model error that the parameters state."""
-        parameters = self._one(params)
         if not self.nuisances.model_error:
             return self.noise
-        level = parameters.background
+        _, nuisances, level = self._one(params)
         slope = polynomial_background(self.mask.shape, level) - level[0]
-        return ModelErrorNoise(self.noise, parameters.nuisances.model_error, slope)
+        return ModelErrorNoise(self.noise, nuisances.model_error, slope)
 
     def _expected(self, params: Floats) -> tuple[Floats, Floats]:
         ny, nx = self.model.detector.shape

@@ -14,6 +14,7 @@ from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.contexts import Clusters, Group
 
 DOF = 3.0  # of Student's distribution of the shifts
+SHARE = DOF / (DOF + 2.0)  # of k in H, see `fluxes.py`
 
 
 class Prior(NamedTuple):
@@ -207,6 +208,14 @@ def shift_prior(shift, scatter):
     """Rho and k of a source's shift, see `fluxes.py`."""
     ratio = (shift[0] ** 2 + shift[1] ** 2) / (DOF * scatter**2)
     return ratio, (DOF + 2.0) / (DOF * scatter**2 * (1.0 + ratio))
+
+
+@inner()
+def bend_prior(shift, scatter):
+    """What -d^2 log p of a shift has beyond its share in H: dx dx, dx dy and dy dy."""
+    ratio, k = shift_prior(shift, scatter)
+    c, more = -2.0 * k / (DOF * scatter**2 * (1.0 + ratio)), (1.0 - SHARE) * k
+    return more + c * shift[0] ** 2, c * shift[0] * shift[1], more + c * shift[1] ** 2
 
 
 @inner()

@@ -24,8 +24,10 @@ rebuilt as the source moves. The shifts dx and dy of a and b have Student's t di
     log p(dx, dy) = -(nu/2 + 1) log(1 + rho) - log(2 pi tau^2),    rho = (dx^2 + dy^2) / nu tau^2,
 
 whose derivative by dx is -k dx with k = (nu + 2) / nu tau^2 (1 + rho). H = sum_p W T T^T +
-diag(a/F^2, k, k), W = -d^2 log L/d mu^2, leaves out the second derivatives, which it weighs with
-residuals of mean zero, and that of k; that makes it positive definite anywhere.
+diag(a/F^2, k', k'), W = -d^2 log L/d mu^2, leaves out the second derivatives, which it weighs with
+residuals of mean zero. With k' = k nu / (nu + 2) it is positive definite anywhere, and the integral
+over the shifts is right where the counts say much of them, so that k' does not count, and where
+they say nothing, so that it is that of the prior, 1.
 """
 
 import math
@@ -41,10 +43,12 @@ from bayesfred.imaging.kernels.geometry import move, row_starts
 from bayesfred.imaging.kernels.render import add_source, add_templates
 from bayesfred.model.kernels.clusters import (
     DOF,
+    SHARE,
     Prior,
     add_block,
     add_prior,
     add_template,
+    bend_prior,
     cholesky,
     gram,
     one_cluster,
@@ -126,12 +130,13 @@ def _subtract_second_derivatives(cluster, i, out):
 
     K_xx = X^2/K - K/sigma^2, K_xy = X Y/K are a Gaussian's that no pixel blurs: near enough to make
     the steps that H gives converge several times faster, for any PSF where it falls no faster than
-    a Gaussian does within eight widths.
+    a Gaussian does within eight widths. The prior's second derivatives are exact.
     """
     fp, stamps, sigma = cluster.layout.footprints, cluster.touching.stamps, cluster.layout.sigma
     score, at, s = cluster.patch.score, cluster.canvas.at, cluster.group.members[i]
     flux = cluster.fluxes[s]
-    fx, fy, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0
+    fx, fy = 0.0, 0.0
+    xx, xy, yy = bend_prior(cluster.shifts[s], cluster.prior.scatter)
     for p in range(fp.first[s], fp.first[s + 1]):
         first = fp.start[p]
         for k in range(fp.size[p]):
@@ -198,7 +203,7 @@ def _maximize(frame, parameters, cluster, h):
         fresh = converged or rate > 0.01  # otherwise the last matrix serves
         if fresh:
             gram(touching, group, patch.weight, at, h)
-            add_prior(h, group, cluster.prior, cluster.fluxes, cluster.shifts, 1.0)
+            add_prior(h, group, cluster.prior, cluster.fluxes, cluster.shifts, SHARE)
         if converged:
             return cholesky(h, group)
         _fill_gradient(cluster, step)

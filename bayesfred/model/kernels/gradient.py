@@ -24,11 +24,11 @@ e_dy likewise. Every source gives d log L the terms c_0 dK + c_1 dX + c_2 dY,
 
     c_0 = F A + z_0 r - W q_0,   c_1 = F (z_1 r - W q_1),   c_2 = F (z_2 r - W q_2),
 
-With the k and rho of `fluxes.py`, G has k - 2 k dx^2 / nu tau^2 (1 + rho) and so on for the prior,
-e_dx gains (Q_11 + Q_22) k dx / nu tau^2 (1 + rho), and
+With k, k' and rho of `fluxes.py`, G has k - 2 k dx^2 / nu tau^2 (1 + rho) and so on for the prior,
+e_dx gains (Q_11 + Q_22) k' dx / nu tau^2 (1 + rho), and
 
-    d log L/d tau = sum_s [k (dx^2 + dy^2) + (Q_11 + Q_22 + 2 z_1 dx + 2 z_2 dy) k / (1 + rho) -
-                    2] / tau.
+    d log L/d tau = sum_s [k (dx^2 + dy^2) - 2 + (k' Q_11 + k' Q_22 + 2 k z_1 dx + 2 k z_2 dy) /
+                    (1 + rho)] / tau.
 
 Model error. The weight W of `model_error.py` is not -dr/dmu, which then replaces it in G and in W
 y; and a change of the background is not that of the light. So the derivatives in the background and
@@ -48,10 +48,12 @@ from bayesfred.imaging.kernels.jacobian import PixelGrid, Rows, basis_row, new_r
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.clusters import (
     DOF,
+    SHARE,
     Prior,
     add_block,
     add_prior,
     add_template,
+    bend_prior,
     cholesky,
     gram,
     one_cluster,
@@ -213,13 +215,10 @@ def _hessian(adjoint, group, prior, shifts, part, lower):
     """Cholesky's factor of G; it is positive definite at a maximum, elsewhere H has to do."""
     size, g = adjoint.mixed.shape[0], np.empty(lower.size)
     gram(adjoint.touching, group, adjoint.response, adjoint.at, g)
-    add_prior(g, group, prior, adjoint.fluxes, shifts, 1.0)
+    add_prior(g, group, prior, adjoint.fluxes, shifts, SHARE)
     for i in range(group.members.size if size > 1 else 0):
         _second_derivatives(adjoint, group, i, part[i * size : (i + 1) * size], g)
-        shift = shifts[group.members[i]]
-        ratio, k = shift_prior(shift, prior.scatter)
-        c = -2.0 * k / (DOF * prior.scatter**2 * (1.0 + ratio))
-        xx, xy, yy = c * shift[0] ** 2, c * shift[0] * shift[1], c * shift[1] ** 2
+        xx, xy, yy = bend_prior(shifts[group.members[i]], prior.scatter)
         add_block(i, group.start, g, (0.0, 0.0, xx, xy, yy))
     return g if cholesky(g, group) else lower
 
@@ -255,7 +254,8 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
             part[i] += shape * diagonal[i] / own**3 - 1.0 / own
             if size > 1:
                 ratio, k = shift_prior(shift[group.members[i // size]], scatter)
-                more = (diagonal[i + 1] + diagonal[i + 2]) * k / (DOF * scatter**2 * (1.0 + ratio))
+                more = (diagonal[i + 1] + diagonal[i + 2]) * SHARE * k
+                more /= DOF * scatter**2 * (1.0 + ratio)
                 part[i + 1] += more * shift[group.members[i // size], 0]
                 part[i + 2] += more * shift[group.members[i // size], 1]
         if size > 1 or response.size > 0:
@@ -267,7 +267,7 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
             add_template(fp, s, stamps[t], part[i], Canvas(y, at))
             if t > 0:
                 d, (ratio, k) = shift[s, t - 1], shift_prior(shift[s], scatter)
-                moved = (diagonal[i] + 2.0 * part[i] * d) / (1.0 + ratio)
+                moved = (SHARE * diagonal[i] + 2.0 * part[i] * d) / (1.0 + ratio)
                 slope += (k * (d * d + moved) - 1.0) / scatter
     return z, mixed, h, y, slope
 

@@ -8,9 +8,9 @@ supremum l* over the mean,
     log p = l* - 1/2 log g - D / 2 g.
 
 For Gaussian noise this is the Gaussian of that variance. For photons it is the double Poisson
-distribution, which is a sum of 1 + O(eps^2 / 12), because g is near 1 unless counts are many: g - 1
-is at most eps^2 mu, and the sum of a distribution of g mu counts differs from 1 by about (g - 1) /
-12 mu. At eps = 0, and where there is no light, it is the noise itself.
+distribution, whose sum is 1 to 0.15 eps^2, because g is near 1 unless counts are many: g - 1 is at
+most eps^2 mu, and the sum differs from 1 by about (g - 1) / 12 mu. At eps = 0, and where there is
+no light, it is the noise itself.
 
 Derivatives. With s, W and C those of l, q = 1 / (V + (eps S)^2), h = V q = 1 / g, u = D / 2 and V'
 = dV/dmu, which is constant, let a, b and c be the derivatives of log g by S, the background B and
