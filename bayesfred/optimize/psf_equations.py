@@ -29,7 +29,8 @@ from bayesfred.optimize.psf_samples import PsfSamples, source_columns, template_
 OUTLYING = 6.0  # standard deviations beyond which a pixel counts less
 PROBES = 40  # draws from which the number of determined coefficients is estimated
 FASTEST = 30.0  # factor by which a strength may change in a turn
-SCATTER, WIDTH = "position_scatter", "psf_sigma"  # parameters that are not solved for here
+SCATTER, WIDTH = "position_scatter", "psf_sigma"
+HELD = (SCATTER, WIDTH, "model_error")  # parameters that are not solved for here
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +224,7 @@ def _joined(
     given = zip(posterior.prior.values(), state.params, strict=True)
     inner_pull = columns.T @ own_pull + select.T @ background[1]
     inner_pull += [priors.slope(prior, x)[0] for prior, x in given]
-    inner_pull[[name in (SCATTER, WIDTH) for name in posterior.parameter_names]] = 0.0
+    inner_pull[[name in HELD for name in posterior.parameter_names]] = 0.0
     cross = coupling.T @ columns + offset @ select
     joint = np.block([[matrix, cross], [cross.T, inner]])
     joint_pull = np.concatenate([pull, inner_pull])
