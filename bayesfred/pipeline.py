@@ -172,7 +172,7 @@ def _follow(posterior: Posterior) -> tuple[Posterior, MapEstimate, list[str]]:
     if lost := int(np.sum(followed.mask & ~found.mask)):
         lines.append(f"{found.message}; {lost} pixels masked")
         followed = replace(followed, mask=found.mask, extrapolation=None)
-        estimate = find_map(followed)
+        estimate = find_map(followed, estimate.params)
     return followed, estimate, lines
 
 

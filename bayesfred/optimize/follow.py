@@ -18,6 +18,7 @@ from bayesfred.optimize.newton import maximize
 from bayesfred.optimize.starts import find_start
 
 ROUNDS = 10
+ENOUGH = 0.9  # of the sources matched near their catalogue positions, all within half the radius
 STEPS = 8  # of Newton's method between two moves of the footprints
 
 
@@ -75,6 +76,11 @@ def follow_images(posterior: Posterior, estimate: MapEstimate | None = None) -> 
 def _start(posterior: Posterior) -> Floats:
     """Where peaks of the whole frame, or those near the catalogue's positions, match better."""
     near = find_start(posterior)
+    s, radius = posterior.model.sources, posterior.nuisances.footprint or 0.0
+    images = posterior.likelihood.image_positions(near.params)
+    off = np.hypot(images[:, 0] - s.x, images[:, 1] - s.y)
+    if near.matched >= ENOUGH * len(s) and np.all(off < 0.5 * radius):
+        return near.params
     anywhere = find_start(_within(posterior, posterior.valid))
     return near.params if near.matched > anywhere.matched else anywhere.params
 

@@ -8,8 +8,9 @@ explains.
 
 A PSF that is not quite right leaves such peaks around bright stars. But they are about the same
 share of the light at the same distance from every star, whereas a source that the catalogue lacks
-stands near one star. So near stars a peak has to exceed, too, 2.5 times the share that is common:
-the 75 % quantile of the bright stars'.
+stands near one star of many. So near stars a peak has to exceed, too, 2.5 times the share that is
+common: the 75 % quantile of the bright stars'. Where such peaks stand near more than a few stars,
+it is the PSF still, and the share is doubled until they do not.
 """
 
 from dataclasses import dataclass, replace
@@ -29,6 +30,8 @@ MISFIT = 2.5  # times that
 STARS = 40  # of which it is measured, the brightest third and at least 5
 FARTHEST = 8.0  # filter widths from a star to which the PSF's misfit is followed
 RINGS = 2  # a filter width
+FEW, MANY = 5, 0.05  # so many near stars, or this share of the stars, may be found
+LOOSER = 6  # times the misfit is doubled, at most, until they are so few: then it is the PSF's
 LOOKS = 5  # for peaks, those that others hid among them
 NAMED = 10  # sources in the message
 
@@ -85,12 +88,11 @@ def find_uncatalogued(posterior: Posterior, estimate: MapEstimate) -> Uncatalogu
     '1 source that the catalogue lacks: (7.0, 6.0) 1975 photons'
     """
     frame = _Filtered(posterior, estimate.params)
-    found = np.zeros((0, 3))  # row, column, photons
-    for _ in range(LOOKS):
-        new = frame.peaks(found)
-        if not len(new):
+    for _ in range(LOOSER):
+        found = frame.search()
+        if frame.near(found) <= max(FEW, MANY * len(frame.flux)):
             break
-        found = np.concatenate([found, new])
+        frame.misfit *= 2.0
     light = frame.light(found)
     spread = ndimage.maximum_filter(light, 2 * int(np.ceil(0.25 * frame.width)) + 1)
     covered = spread > FAINT * np.sqrt(frame.variance)
@@ -184,6 +186,25 @@ class _Filtered:
             share[k] /= max(self.flux[stars[k]], 1.0)
         return MISFIT * np.quantile(share, COMMON, axis=0) if len(stars) else np.zeros(rings)
 
+    def search(self) -> Floats:
+        """Row, column and photons of what is found."""
+        found = np.zeros((0, 3))
+        for _ in range(LOOKS):
+            new = self.peaks(found)
+            if not len(new):
+                break
+            found = np.concatenate([found, new])
+        return found
+
+    def near(self, found: Floats) -> int:
+        """How many of these stand on pixels in use and within the reach of a star's misfit."""
+        if not len(self.images):
+            return 0
+        row, column = np.clip(np.rint(found[:, :2]).astype(int), 0, np.array(self.sd.shape) - 1).T
+        distance, _ = spatial.cKDTree(self.images).query(found[:, :2])
+        used = self.posterior.mask[row, column]
+        return int(np.sum(used & (distance < FARTHEST * self.width)))
+
     def peaks(self, found: Floats) -> Floats:
         """Peaks that neither stars nor what was found explain: row, column, photons."""
         excess, size = self._excess(found), 2 * int(np.ceil(2.0 * self.width)) + 1
@@ -202,6 +223,8 @@ class _Filtered:
                 distance = np.hypot(*(lights[some] - places[k]).T) / self.width
                 ring = np.minimum((RINGS * distance).astype(int), len(self.misfit) - 1)
                 above[k] -= np.sum(fluxes[some] * self.misfit[ring])
+                if np.any(distance < 1.0):  # a star of another brightness or width
+                    above[k] = -np.inf
         row, column = row[above > 0.0], column[above > 0.0]
         positions, t = vertex(excess, row, column), np.sqrt(self.area / np.pi)
         off = ((positions - np.column_stack([row, column])) ** 2).sum(axis=1) / (2.0 * t)
