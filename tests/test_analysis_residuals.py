@@ -89,7 +89,7 @@ def uniformity(noise: Noise, assumed: Noise, level: float, rounded: float = 0.0)
     if rounded:
         counts = rounded * np.rint(counts / rounded)
     posterior = Posterior(posterior.model, counts, noise=assumed)
-    pit = randomised_pit(posterior, fit_sources(posterior, params), level, seed=2)
+    pit = randomised_pit(posterior, params, fit_sources(posterior, params), seed=2)
     assert pit is not None
     return float(stats.kstest(pit, "uniform").pvalue)
 

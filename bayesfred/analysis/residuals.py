@@ -133,7 +133,6 @@ def randomised_pit(
     params : ndarray, shape (d,)
     fits : SourceFits
         For the expected counts.
-        The background.
     seed : int
     leverage : ndarray, shape (ny * nx,), optional
         Share of a residual's variance that the fit took away; the residual is scaled up by it.
