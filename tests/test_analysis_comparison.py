@@ -86,8 +86,10 @@ def exact(
             each = np.log1p(ratio) @ n - LEVEL * ratio.sum(axis=-1)  # flux, along v, along u
             each = logsumexp(each + weigh_flux[:, None, None], axis=0)
             for j, size in enumerate(tau):
-                normal = stats.norm(0.0, size).logpdf(shift) + np.log(step)
-                weigh = normal[:, None] + normal if shift.size > 1 else np.zeros((1, 1))
+                # Student's t in two dimensions, of 3 degrees of freedom
+                rho = (shift[:, None] ** 2 + shift**2) / (3.0 * size**2)
+                weigh = -2.5 * np.log1p(rho) + np.log(step**2 / (2.0 * np.pi * size**2))
+                weigh = weigh if shift.size > 1 else np.zeros((1, 1))
                 by_source[s, i, j] = logsumexp(each + weigh)
     prior = posterior.prior["f_x"].logpdf(theta)[:, None]
     if "position_scatter" in names:
