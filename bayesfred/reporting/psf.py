@@ -141,7 +141,7 @@ def described_psf(psf: MeasuredPSF) -> str:
     --------
     >>> x = np.arange(-20, 21) / 4
     >>> described_psf(MeasuredPSF(np.exp(-(x**2 + x[:, None] ** 2) / 2)[None], 4.0, 100.0))
-    'A PSF with a FWHM of 2.43 pixels, the same all over the field. It differs from the Gaussian...'
+    'A PSF with a FWHM of 2.37 pixels, the same all over the field. It differs from the Gaussian...'
     """
     far = np.abs(_less_gaussian(psf, _axis(psf))).max()
     field = f"varying with degree {psf.degree} over" if psf.degree else "the same all over"

@@ -38,9 +38,8 @@ def posterior(name: str, **model: Any) -> bf.Posterior:
     made, _ = build.simulated(run, path, run.simulation.seed)
     changed = run.model_copy(update={"model": run.model.model_copy(update=model)})
     sources, shape = made.model.sources, made.model.detector.shape
-    return build.posterior_given(
-        changed, build.forward_model(changed, shape, sources, made.model.psf), made.counts, None
-    )
+    model = build.forward_model(changed, shape, sources, made.model.psf)
+    return build.posterior_given(changed, model, made.counts, None, made.noise)
 
 
 def counts_hash(counts: Floats) -> str:

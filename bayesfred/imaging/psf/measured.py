@@ -108,7 +108,7 @@ class MeasuredPSF:
     >>> x = np.arange(-20, 21) / 4
     >>> psf = MeasuredPSF(np.exp(-(x**2 + x[:, None] ** 2) / 2)[None], 4.0, 100.0)
     >>> psf.degree, round(psf.sigma, 1), round(float(psf.density(0.0, 0.0)), 2)
-    (0, 1.0, 0.15)
+    (0, 1.0, 0.16)
     """
 
     coefficients: Floats
