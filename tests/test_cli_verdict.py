@@ -60,6 +60,7 @@ def need(name: str) -> None:
         pytest.skip("no real frames: BAYESFRED_DATA does not name their folder")
 
 
+@pytest.mark.long
 def test_a_star_tracker_fitted_with_a_gaussian_blames_the_psf(tmp_path: Path) -> None:
     """Its stars are narrower than two pixels and no Gaussians."""
     need("startracker_alt60_azi45.fits")

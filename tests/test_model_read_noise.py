@@ -204,7 +204,9 @@ def test_bright_dark_and_masked_pixels_are_summed_alike(r: float) -> None:
     assert ours == pytest.approx(theirs, rel=1e-8 if r < 1.0 else 1e-6)
 
 
-@pytest.mark.parametrize("case", FRAMES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(k, marks=[pytest.mark.long] * (k == "map")) for k in FRAMES]
+)
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     posterior, truth = frame(case)
     scale = errors(posterior, truth)

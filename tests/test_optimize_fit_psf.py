@@ -271,6 +271,7 @@ def test_a_psf_that_varies_over_the_field_is_rendered_as_its_definition_says():
     np.testing.assert_allclose(model.jacobian(theta), slopes, atol=1e-4 * np.abs(slopes).max())
 
 
+@pytest.mark.long
 def test_gradient_and_information_with_a_psf_that_varies():
     model, theta = varying_model(np.random.default_rng(4))
     counts = bf.simulate(model, theta, 20.0, seed=1)

@@ -116,6 +116,26 @@ def test_wings_of_the_psf_are_no_companions() -> None:
     assert np.mean([len(each.u) for each in more]) > 2.5
 
 
+def test_a_source_far_off_its_place_is_left_out_whole() -> None:
+    """It is taken for one that the catalogue lacks, and little else is left of its pixels."""
+    sources = planted.field(5)
+    model = planted.camera(sources, psf=bf.GaussianPSF(1.2))
+    there = replace(sources, x=sources.x + 4.0 * (np.arange(len(sources)) == 7))
+    mean = replace(model, sources=there).expected_counts(planted.THETA, planted.LEVEL)
+    counts = np.random.default_rng(5).poisson(mean)
+    nuisances = bf.Nuisances("free", offset=True, footprint=6.0)
+    posterior = bf.Posterior(model, counts, nuisances=nuisances)
+    found = looked(posterior)
+    assert found.hidden.tolist() == [7]
+    assert found.message.endswith("hidden by them: rows 7 of the catalogue, from 0")
+    image = posterior.likelihood.image_positions(bf.find_map(posterior).params)[7]
+    u, v = model.detector.pixel_centres()
+    near = np.hypot(u - image[0], v[:, None] - image[1]) < 6.0
+    assert near.any() and not found.mask[near].any()
+    estimate = bf.find_map(replace(bf.follow_images(posterior), mask=found.mask))
+    assert estimate.at_maximum and estimate.fits_data
+
+
 def test_positions_and_photons_have_their_errors() -> None:
     model = planted.camera(planted.field(3))
     rng, z, off = np.random.default_rng(3), [], []

@@ -158,7 +158,11 @@ def made(
 @pytest.mark.parametrize(
     ("nuisances", "detector"),
     [
-        (Nuisances("scale", offset=True, psf_sigma=True), Detector(SHAPE)),
+        pytest.param(
+            Nuisances("scale", offset=True, psf_sigma=True),
+            Detector(SHAPE),
+            marks=pytest.mark.long,
+        ),
         pytest.param(
             Nuisances("free", psf_sigma=True, position_scatter=True),
             Detector((30, 37), 2, "box"),

@@ -11,6 +11,9 @@ share of the light at the same distance from every star, whereas a source that t
 stands near one star of many. So near stars a peak has to exceed, too, 2.5 times the share that is
 common: the 75 % quantile of the bright stars'. Where such peaks stand near more than a few stars,
 it is the PSF still, and the share is doubled until they do not.
+
+A catalogued source that would keep less than half of its light says little but where it might be:
+behind the mask, as bright as can be. It is left out with all of its pixels.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage, signal, spatial
 
-from bayesfred._typing import Flags, Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
@@ -34,6 +37,7 @@ FEW, MANY = 5, 0.05  # so many near stars, or this share of the stars, may be fo
 LOOSER = 6  # times the misfit is doubled, at most, until they are so few: then it is the PSF's
 LOOKS = 5  # for peaks, those that others hid among them
 NAMED = 10  # sources in the message
+LEFT = 0.5  # share of its light that a source must keep, or it is left out with the light beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +51,12 @@ class UncataloguedSources:
     photons, sd : ndarray, shape (n,), counts
         Its flux, for an image like the PSF, and the standard deviation from the noise.
     mask : ndarray of bool, shape (ny, nx)
-        The posterior's pixels but for those that this light reaches.
+        The posterior's pixels but for those that this light reaches, and for those of catalogued
+        sources that it hides.
+    hidden : ndarray of int
+        These sources' numbers in the catalogue, from 0.
     message : str
-        One line: how many there are, and the brightest ones' positions and photons.
+        One line: how many there are, the brightest ones' positions and photons, and what they hide.
     """
 
     u: Floats
@@ -57,6 +64,7 @@ class UncataloguedSources:
     photons: Floats
     sd: Floats
     mask: Flags
+    hidden: Ints
     message: str
 
 
@@ -105,18 +113,21 @@ def find_uncatalogued(posterior: Posterior, estimate: MapEstimate) -> Uncatalogu
     found, sd = found[order], sd[order]
     detector = posterior.model.detector
     v, u = (found[:, :2] - 0.5 * (np.array(detector.shape) - 1.0)).T * detector.binning
-    kept, message = posterior.mask & ~covered, _message(u, v, found[:, 2])
-    return UncataloguedSources(u, v, found[:, 2], sd, kept, message)
+    kept, hidden = frame.without_hidden(posterior.mask & ~covered)
+    message = _message(u, v, found[:, 2], hidden)
+    return UncataloguedSources(u, v, found[:, 2], sd, kept, hidden, message)
 
 
-def _message(u: Floats, v: Floats, photons: Floats) -> str:
+def _message(u: Floats, v: Floats, photons: Floats, hidden: Ints) -> str:
     n = len(u)
     if not n:
         return "no source that the catalogue lacks"
     named = zip(u[:NAMED], v[:NAMED], photons[:NAMED], strict=True)
     places = ", ".join(f"({a:.1f}, {b:.1f}) {flux:.0f} photons" for a, b, flux in named)
     more = f" and {n - NAMED} fainter ones" if n > NAMED else ""
-    return f"{n} source{'s' * (n > 1)} that the catalogue lacks: {places}{more}"
+    rows = ", ".join(map(str, hidden[:NAMED])) + ", ..." * (hidden.size > NAMED)
+    lost = f"; hidden by them: rows {rows} of the catalogue, from 0" if hidden.size else ""
+    return f"{n} source{'s' * (n > 1)} that the catalogue lacks: {places}{more}{lost}"
 
 
 class _Filtered:
@@ -138,7 +149,7 @@ class _Filtered:
         images = images + 0.5 * (np.array([ny, nx]) - 1.0)  # row, column
         self.flux = posterior.fluxes(params)
         seen = np.isfinite(images).all(axis=1) & np.isfinite(self.flux)
-        self.images, self.flux = images[seen], self.flux[seen]
+        self.rows, self.images, self.flux = np.flatnonzero(seen), images[seen], self.flux[seen]
         reach = 2 * int(np.ceil(4.0 * self.width)) + 1
         delta = np.zeros((reach, reach))
         delta[reach // 2, reach // 2] = 1.0
@@ -185,6 +196,23 @@ class _Filtered:
             np.maximum.at(share[k], ring[near].astype(int), window[near])
             share[k] /= max(self.flux[stars[k]], 1.0)
         return MISFIT * np.quantile(share, COMMON, axis=0) if len(stars) else np.zeros(rings)
+
+    def without_hidden(self, kept: Flags) -> tuple[Flags, Ints]:
+        """A mask without the sources that keep too little of their light, and their rows."""
+        out, hidden = kept.copy(), []
+        if not len(self.images):
+            return out, np.array(hidden, dtype=np.int64)
+        tree, reach = spatial.cKDTree(self.images), int(np.ceil(FARTHEST * self.width))
+        for k, (row, column) in enumerate(np.rint(self.images).astype(int)):
+            rows, columns = (slice(max(0, m - reach), max(0, m + reach + 1)) for m in (row, column))
+            at = np.stack(np.nonzero(self.posterior.mask[rows, columns]), axis=1)
+            at += (rows.start, columns.start)
+            light = np.exp(-((at - self.images[k]) ** 2).sum(axis=1) / (2.0 * self.width**2))
+            left = kept[tuple(at.T)]
+            if light @ left < LEFT * light.sum():
+                out[tuple(at[tree.query(at)[1] == k].T)] = False
+                hidden.append(self.rows[k])
+        return out, np.array(hidden, dtype=np.int64)
 
     def search(self) -> Floats:
         """Row, column and photons of what is found."""
