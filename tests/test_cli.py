@@ -41,7 +41,6 @@ from bayesfred.io import catalogues, frames
 from bayesfred.io.hdf5_checks import seal
 from bayesfred.io.tables import read_table
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import find_map
 from bayesfred.pipeline import read_frame
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import fingerprint, open_chain

@@ -236,6 +236,16 @@ def _deviates(z: Floats, terms: tuple[Floats, Floats, Floats], owner: Ints) -> F
     here = far[owner]
     index = (np.cumsum(far) - 1)[owner[here]]
     a, variance, slope, x = a[here], variance[here], slope[here], z[far]
+    # a sum below the least that counts allow has no such s: it stays as far as it is
+    with np.errstate(all="ignore"):
+        corrected = _saddlepoint(x, a, variance, slope, index)
+    out = z.copy()
+    out[far] = np.where(np.isfinite(corrected), corrected, x)
+    return out
+
+
+def _saddlepoint(x: Floats, a: Floats, variance: Floats, slope: Floats, index: Ints) -> Floats:
+    """Barndorff-Nielsen's form: see the head of the module."""
     s = x.copy()
     for _ in range(ITERATIONS):
         g = slope * a * s[index]
@@ -248,9 +258,7 @@ def _deviates(z: Floats, terms: tuple[Floats, Floats, Floats], owner: Ints) -> F
     k = np.bincount(index, variance * a**2 * half, x.size) * s**2
     second = np.bincount(index, variance * a**2 * np.exp(g), x.size)
     r = np.sign(s) * np.sqrt(2.0 * np.maximum(s * x - k, 1e-12))
-    out = z.copy()
-    out[far] = r + np.log(s * np.sqrt(second) / r) / r
-    return out
+    return np.asarray(r + np.log(s * np.sqrt(second) / r) / r)
 
 
 def _chi_square(fits: SourceFits, taken: Absorbed, free: int) -> Floats:
