@@ -199,7 +199,8 @@ class _Filtered:
 
     def without_hidden(self, kept: Flags) -> tuple[Flags, Ints]:
         """A mask without the sources that keep too little of their light, and their rows."""
-        out, hidden = kept.copy(), []
+        out = kept.copy()
+        hidden: list[int] = []
         if not len(self.images):
             return out, np.array(hidden, dtype=np.int64)
         tree, reach = spatial.cKDTree(self.images), int(np.ceil(FARTHEST * self.width))
@@ -211,7 +212,7 @@ class _Filtered:
             left = kept[tuple(at.T)]
             if light @ left < LEFT * light.sum():
                 out[tuple(at[tree.query(at)[1] == k].T)] = False
-                hidden.append(self.rows[k])
+                hidden.append(int(self.rows[k]))
         return out, np.array(hidden, dtype=np.int64)
 
     def search(self) -> Floats:
