@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import atomic, frames, outputs, paths, tables
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.find_map import find_map, reject_outliers
+from bayesfred.optimize.find_map import approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.uncatalogued import find_uncatalogued
@@ -134,16 +135,17 @@ def read_frame(
     with naming(run_file):
         model = build.forward_model(run, shape, sources, psf)
         posterior = build.posterior_given(run, model, frame.counts, frame.valid, noise)
-        estimate = None
+        estimate, rough = None, isinstance(psf, PSFToMeasure)
         if posterior.nuisances.footprint is not None:
             with searching() if say else nullcontext():
-                posterior, estimate, lines = _follow(posterior)
+                posterior, estimate, lines = _follow(posterior, rough=rough)
             for line in lines:
                 note(line)
         if f.reject_outliers:
             with searching() if say else nullcontext():
                 start = None if estimate is None else estimate.params
-                kept, estimate = reject_outliers(posterior, start)
+                reject = partial(approach, rejecting=True) if rough else reject_outliers
+                kept, estimate = reject(posterior, start)
             note(_census(posterior, kept))
             posterior = kept
         if run.distortion.terms == "choose":
@@ -152,27 +154,28 @@ def read_frame(
             posterior, estimate = choice.posterior, choice.estimate
             for line in choice.lines():
                 note(line)
-        if has_pixel(posterior.model.psf) or isinstance(psf, PSFToMeasure):
+        if has_pixel(posterior.model.psf) or rough:
             with searching("measuring the PSF") if say else nullcontext():
                 posterior, estimate = _with_measured_psf(posterior, estimate, psf)
             note(psf_message(posterior))
     return posterior, estimate, notes
 
 
-def _follow(posterior: Posterior) -> tuple[Posterior, MapEstimate, list[str]]:
-    """Footprints around the images, without the sources there that the catalogue lacks."""
+def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimate, list[str]]:
+    """Footprints around the images, without sources that the catalogue lacks; the maximum."""
     followed = follow_images(posterior)
     shared = int(np.sum(followed.mask & posterior.mask))
     lines = [
         f"footprints: {followed.mask.sum()} pixels around the images, {shared} of which are as "
         "near to the catalogue's positions"
     ]
-    estimate = find_map(followed)
+    estimate = approach(followed)[1] if rough else find_map(followed)
     found = find_uncatalogued(followed, estimate)
     if lost := int(np.sum(followed.mask & ~found.mask)):
         lines.append(f"{found.message}; {lost} pixels masked")
         followed = replace(followed, mask=found.mask, extrapolation=None)
-        estimate = find_map(followed, estimate.params)
+        start = estimate.params
+        estimate = approach(followed, start)[1] if rough else find_map(followed, start)
     return followed, estimate, lines
 
 

@@ -12,6 +12,7 @@ from test_pipeline_frames import GAIN, RUN, write
 
 import bayesfred as bf
 from bayesfred import pipeline
+from bayesfred.optimize.find_map import approach
 from bayesfred.settings import read_settings
 
 Floats = NDArray[np.float64]
@@ -156,6 +157,23 @@ def test_positions_and_photons_have_their_errors() -> None:
 
 def estimate_at(params: Floats) -> bf.MapEstimate:
     return bf.MapEstimate(params, np.eye(params.size), 0.0, 0, "")
+
+
+def test_a_rough_search_ends_near_the_maximum() -> None:
+    sources = planted.field(6)
+    model = planted.camera(sources)
+    counts = planted.counts(model, 6)
+    row, column = np.argwhere(model.expected_counts(planted.THETA) < 1e-3)[500]
+    counts[row : row + 3, column : column + 3] += 300.0  # of no source
+    posterior = bf.Posterior(model, counts, nuisances=bf.Nuisances("free", offset=True))
+    kept, near = approach(posterior, rejecting=True)
+    assert not kept.mask[row + 1, column + 1] and len(kept.model.sources) == len(sources)
+    top = bf.find_map(kept, near.params)
+    off = near.params - top.params
+    assert np.sqrt(off @ np.linalg.solve(top.covariance, off)) < 0.2
+    # negative control: where it began
+    off = posterior.start() - top.params
+    assert np.sqrt(off @ np.linalg.solve(top.covariance, off)) > 5.0
 
 
 def test_a_run_prints_what_it_masks(tmp_path: Path) -> None:

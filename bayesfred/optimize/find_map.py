@@ -26,6 +26,8 @@ from bayesfred.optimize.starts import Start, find_start, other_starts
 # of its error.
 CLOSENESS = 1e-3
 
+STEPS = 8  # of Newton's method where the maximum itself is not wanted
+
 NO_DENSITY = (
     "start: the posterior has no density there, expected parameters within the prior whose map "
     "does not fold"
@@ -137,6 +139,42 @@ def reject_outliers(
     (True, False, 9)
     """
     return _search(reject, posterior, start)
+
+
+def approach(
+    posterior: Posterior, start: Floats | None = None, *, rejecting: bool = False
+) -> tuple[Posterior, MapEstimate]:
+    """Go near the maximum of a posterior whose PSF has yet to be measured.
+
+    With a PSF that is not the frame's the maximum is slow to reach, and of little use.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    start : ndarray, shape (d,), optional
+        Where to begin; by default what the counts alone say.
+    rejecting : bool
+        Leave out outliers, as `reject_outliers` does.
+
+    Returns
+    -------
+    posterior : Posterior
+        Of what is kept.
+    estimate : MapEstimate
+        After a few of Newton's steps.
+
+    Raises
+    ------
+    InputError
+        If the start has no posterior density.
+    """
+    with threadpool_limits(1, user_api="blas"):
+        params = find_start(posterior).params if start is None else start
+        if not np.isfinite(posterior.log_prob(params)):
+            raise InputError(NO_DENSITY)
+        kept, params, _ = (reject if rejecting else keep_all)(posterior, params)
+        top = maximize(kept.posterior, params, steps=STEPS)
+        return kept.posterior, _estimate(kept.posterior, top, top.evaluations, "")
 
 
 def _search(
