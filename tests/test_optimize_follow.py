@@ -8,6 +8,7 @@ import planted
 import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
+from scipy import stats
 from test_pipeline_frames import GAIN, RUN, write
 
 import bayesfred as bf
@@ -174,6 +175,15 @@ def test_a_rough_search_ends_near_the_maximum() -> None:
     # negative control: where it began
     off = posterior.start() - top.params
     assert np.sqrt(off @ np.linalg.solve(top.covariance, off)) > 5.0
+
+
+def test_a_rough_search_refuses_what_the_frame_cannot_determine() -> None:
+    sources = bf.SourceCatalog([0.0, 20.0], [0.0, 5.0], [5e3, 5e3])
+    model = planted.camera(sources, distortion=bf.PolynomialDistortion.polynomial(3))
+    counts = bf.simulate(model, np.zeros(18), 5.0, seed=1)
+    flat = {name: stats.norm(0.0, 1e3) for name in model.distortion.names}
+    with pytest.raises(bf.InputError, match="the frame cannot determine"):
+        approach(bf.Posterior(model, counts, prior=flat))
 
 
 def test_a_run_prints_what_it_masks(tmp_path: Path) -> None:

@@ -111,10 +111,10 @@ def usable(move: LaplaceMove, posterior: Posterior) -> float:
 
 def test_scattered_positions_get_a_nested_approximation() -> None:
     rng = np.random.default_rng(43)
-    terms = [(1, 0, 0, 0), (0, 1, 0, 0)]  # many sources a term: with few a Gaussian is a poor one
+    terms = [(1, 0, 0, 0), (0, 1, 0, 0)]  # of many, given the scatter, no Gaussian is good either
     distortion = PolynomialDistortion(terms, terms)
-    grid = SourceCatalog.grid(5, 14.0, 5e3)
-    off = 0.2 * rng.standard_normal((2, 25))
+    grid = SourceCatalog.grid(4, 17.5, 5e3)
+    off = 0.2 * rng.standard_normal((2, 16))
 
     def model(x: Floats, y: Floats) -> ForwardModel:
         return ForwardModel(
@@ -129,5 +129,5 @@ def test_scattered_positions_get_a_nested_approximation() -> None:
     estimate = find_map(posterior)
     nested = LaplaceMove.of(posterior, estimate)
     assert len(nested.weights) > 1 and usable(nested, posterior) > 0.5
-    # negative control: a single Gaussian
-    assert usable(LaplaceMove(estimate.params, estimate.covariance), posterior) < 0.35
+    # negative control: a single Gaussian is hardly of use
+    assert usable(LaplaceMove(estimate.params, estimate.covariance), posterior) < 0.1

@@ -166,12 +166,13 @@ def approach(
     Raises
     ------
     InputError
-        If the start has no posterior density.
+        If the start has no posterior density, or the frame cannot determine some parameters.
     """
     with threadpool_limits(1, user_api="blas"):
         params = find_start(posterior).params if start is None else start
         if not np.isfinite(posterior.log_prob(params)):
             raise InputError(NO_DENSITY)
+        _require_determined(posterior, params, posterior.fisher(params))
         kept, params, _ = (reject if rejecting else keep_all)(posterior, params)
         top = maximize(kept.posterior, params, steps=STEPS)
         return kept.posterior, _estimate(kept.posterior, top, top.evaluations, "")
