@@ -160,15 +160,17 @@ def estimate_at(params: Floats) -> bf.MapEstimate:
     return bf.MapEstimate(params, np.eye(params.size), 0.0, 0, "")
 
 
-def test_a_rough_search_ends_near_the_maximum() -> None:
+@pytest.mark.parametrize("rejecting", [True, False])
+def test_a_rough_search_ends_near_the_maximum(rejecting: bool) -> None:
     sources = planted.field(6)
     model = planted.camera(sources)
     counts = planted.counts(model, 6)
     row, column = np.argwhere(model.expected_counts(planted.THETA) < 1e-3)[500]
-    counts[row : row + 3, column : column + 3] += 300.0  # of no source
+    counts[row : row + 3, column : column + 3] += 300.0 * rejecting  # of no source
     posterior = bf.Posterior(model, counts, nuisances=bf.Nuisances("free", offset=True))
-    kept, near = approach(posterior, rejecting=True)
-    assert not kept.mask[row + 1, column + 1] and len(kept.model.sources) == len(sources)
+    kept, near = approach(posterior, rejecting=rejecting)
+    assert kept.mask[row + 1, column + 1] != rejecting
+    assert len(kept.model.sources) == len(sources)
     top = bf.find_map(kept, near.params)
     off = near.params - top.params
     assert np.sqrt(off @ np.linalg.solve(top.covariance, off)) < 0.2
