@@ -127,13 +127,14 @@ def posterior_given(
     noise: Noise,
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
-    nuisances = run.nuisances.make()
-    if isinstance(model.psf, PSFToMeasure):  # its width is looked for first
-        nuisances = replace(nuisances, psf_sigma=True)
+    nuisances, prior = run.nuisances.make(), priors_given(run)
+    if isinstance(model.psf, PSFToMeasure):  # its width is looked for first, its error last
+        nuisances = replace(nuisances, psf_sigma=True, model_error=False)
+        prior.pop("model_error", None)
     return Posterior(
         model,
         counts,
-        prior=priors_given(run),
+        prior=prior,
         noise=noise,
         mask=mask,
         nuisances=nuisances,

@@ -156,7 +156,7 @@ def read_frame(
                 note(line)
         if has_pixel(posterior.model.psf) or rough:
             with searching("measuring the PSF") if say else nullcontext():
-                posterior, estimate = _with_measured_psf(posterior, estimate, psf)
+                posterior, estimate = _with_measured_psf(posterior, estimate, psf, run)
             note(psf_message(posterior))
     return posterior, estimate, notes
 
@@ -180,12 +180,15 @@ def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimat
 
 
 def _with_measured_psf(
-    posterior: Posterior, estimate: MapEstimate | None, psf: PSF
+    posterior: Posterior, estimate: MapEstimate | None, psf: PSF, run: settings.RunSettings
 ) -> tuple[Posterior, MapEstimate]:
     """The posterior with the errors of its PSF, which is measured first if that is asked for."""
     estimate = estimate or find_map(posterior)
     if isinstance(psf, PSFToMeasure):
-        return measure_psf(posterior, estimate, oversampling=psf.oversampling, degree=psf.degree)
+        return measure_psf(
+            posterior, estimate, oversampling=psf.oversampling, degree=psf.degree,
+            model_error=run.nuisances.model_error, prior=build.priors_given(run),
+        )  # fmt: skip
     posterior = marginalize_psf(posterior, estimate)
     return posterior, find_map(posterior, estimate.params)
 
@@ -341,8 +344,7 @@ def write_results(
     atomic.replace(picture, png(overview(fitted, chain.draws(), posterior.parameters, truth=truth)))
     if isinstance(posterior.model.psf, MeasuredPSF):
         posterior.model.psf.write(outputs.psf_beside(page), overwrite=True)
-    found = diagnostics.sources
-    columns = {name: found[name].data for name in found.colnames}
+    columns = {name: column.data for name, column in diagnostics.sources.columns.items()}
     tables.write_table(sources, tables.TableRecord(columns, SOURCES_META), overwrite=True)
     return Result(chain, diagnostics, field, table, path, page, picture, sources)
 

@@ -212,7 +212,7 @@ def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None 
             sources=SimpleNamespace(flux=np.ones(1)), polynomial=SimpleNamespace(n_terms=0)
         ),
         expected_counts=lambda params: params[0] * spot + params[1],
-        loss=None,
+        psf_errors=None,
         noise_at=lambda params: noise,
         log_prior=lambda draws: np.zeros(len(draws)),
     )

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import bayesfred as bf
-from bayesfred.model.information_loss import InformationLoss
-from bayesfred.model.kernels.psf_normal import SourceSamples, normal_equations, sample_psf
+from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
+from bayesfred.model.kernels.psf_samples import SourceSamples
+from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.optimize.fit_psf import solved, starting_state
 from bayesfred.optimize.psf_levels import PsfGrid
 
@@ -47,11 +48,12 @@ def crowded(rng, n_pixels=40, n_sources=3):
     return SourceSamples(first, source, a, b, rng.uniform(0.9, 1.1, size))
 
 
-def test_normal_equations_agree_with_a_dense_design_matrix():
+@pytest.mark.parametrize(("degree", "wings"), [(1, True), (1, False), (0, True), (0, False)])
+def test_information_and_slope_agree_with_a_dense_design_matrix(degree, wings):
     rng = np.random.default_rng(1)
-    grid = PsfGrid(1.3, 0.8, 1, wings=True)
+    grid = PsfGrid(1.3, 0.8, degree, 5.6, 16.8 if wings else 0.0)
     samples = crowded(rng)
-    field = np.column_stack([np.ones(3), rng.normal(size=(3, 2))])
+    field = np.column_stack([np.ones(3), rng.normal(size=(3, 2 * degree))])
     levels, n = grid.unknown, len(samples.first) - 1
     design = dense_design(levels, field, samples)
     flux, weight = rng.uniform(1.0, 2.0, 3), rng.uniform(0.0, 1.0, n)
@@ -63,13 +65,15 @@ def test_normal_equations_agree_with_a_dense_design_matrix():
     light = np.zeros((n, 9))
     for m in range(3):
         np.add.at(light, (owner, 3 * samples.source + m), templates[m])
-    pixels = flux, weight, residual, background
-    half, coupling, others = normal_equations(levels, field, samples, pixels, templates)
+    half, coupling, others = psf_information(
+        levels, field, samples, (flux, weight, background), templates
+    )
+    slope = psf_slope(levels, field, samples, flux, weight * residual)
     weighed = rows.T * weight
     np.testing.assert_allclose(half + half.T, weighed @ rows, atol=1e-11)
     np.testing.assert_allclose(coupling.T, weighed @ light, atol=1e-11)
-    np.testing.assert_allclose(others[:, :2], weighed @ background, atol=1e-11)
-    np.testing.assert_allclose(others[:, 2], weighed @ residual, atol=1e-11)
+    np.testing.assert_allclose(others, weighed @ background, atol=1e-11)
+    np.testing.assert_allclose(slope, weighed @ residual, atol=1e-11)
     coefficients = rng.normal(size=design.shape[1])
     p, p_a, p_b = sample_psf(levels, field, samples, coefficients)
     np.testing.assert_allclose(p, design @ coefficients, atol=1e-11)
@@ -85,7 +89,7 @@ def test_normal_equations_agree_with_a_dense_design_matrix():
 
 def test_the_grids_together_are_one_fine_grid():
     rng = np.random.default_rng(2)
-    grid = PsfGrid(4.0, 0.7, 2, wings=True)
+    grid = PsfGrid(4.0, 0.7, 2, 4.9, 14.7)
     c = rng.normal(size=grid.conventions.shape[1])
     psf = grid.combined(c)
     n = psf.shape[-1]
@@ -181,7 +185,7 @@ def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
 
 
 def test_errors_of_the_psf_are_those_of_a_joint_fit():
-    """The loss comes from gradients at drawn PSFs, the joint fit from one matrix."""
+    """The former come from gradients at drawn PSFs, the joint fit from one matrix."""
     _, _, posterior = frame_of(bf.MoffatPSF(1.2, 4.765), 1.2, side=4)
     estimate = bf.find_map(posterior)
     measured, known = bf.measure_psf(posterior, estimate)
@@ -192,7 +196,7 @@ def test_errors_of_the_psf_are_those_of_a_joint_fit():
     joint = equations.draws(20_000)[kept].std(axis=1)
     own = [k for k, name in enumerate(measured.parameter_names) if name != "background"]
     marginal = np.sqrt(np.diag(known.covariance))[own]
-    conditional = np.linalg.inv(replace(measured, loss=None).information(known.params))
+    conditional = np.linalg.inv(measured.information(known.params))
     widening = marginal / np.sqrt(np.diag(conditional))[own]
     # 100 draws know what is added to a variance to 14 %
     np.testing.assert_allclose(marginal, joint, rtol=0.1)
@@ -215,7 +219,7 @@ def test_conventions_of_volume_and_centroid():
         np.testing.assert_allclose(centroids, 0.0, atol=1e-3)
 
 
-def test_information_loss_is_that_of_a_joint_fit():
+def test_what_a_psf_adds_is_that_of_a_joint_fit():
     """Against Schur's complement, of a posterior that is normal in parameters and PSF."""
     rng = np.random.default_rng(3)
     half = rng.normal(size=(7, 9))
@@ -223,20 +227,42 @@ def test_information_loss_is_that_of_a_joint_fit():
     i, k, c = joint[:3, :3], joint[:3, 3:], joint[3:, 3:]
     marginal = np.linalg.inv(c - k.T @ np.linalg.inv(i) @ k)
     draws = rng.multivariate_normal(np.zeros(4), marginal, 20_000)
-    loss = InformationLoss.of(("a", "b", "c"), np.zeros(3), i, draws @ k.T)
-    schur = i - k @ np.linalg.inv(c) @ k.T
-    np.testing.assert_allclose(loss.remaining, schur, atol=0.05 * np.abs(schur).max())
-    np.testing.assert_allclose(loss.left_of(i), loss.remaining, rtol=1e-9)
-    for scale in (0.1, 300.0):
-        at, step = scale * np.array([1.0, -2.0, 0.5]), 1e-5 * scale
-        slope = [
-            (loss.log_factor((at + e)[None]) - loss.log_factor((at - e)[None]))[0] / (2 * step)
-            for e in step * np.eye(3)
-        ]
-        np.testing.assert_allclose(loss.gradient(at), slope, rtol=1e-5, atol=1e-9)
-    far = np.outer(np.geomspace(1.0, 1e6, 50), [1.0, 1.0, 1.0])
-    value = loss.log_factor(far) - 0.5 * np.einsum("ni,ij,nj->n", far, i, far)
-    assert np.all(np.diff(value) < 0.0)  # it stays a density
+    errors = PsfErrors.of(("a", "b", "c"), i, draws @ k.T)
+    schur = np.linalg.inv(i - k @ np.linalg.inv(c) @ k.T)
+    np.testing.assert_allclose(np.linalg.inv(i) + errors.covariance, schur, rtol=0.02, atol=2e-3)
+    moved = errors.displacements(20_000, 1)
+    np.testing.assert_allclose(np.cov(moved.T), errors.covariance, rtol=0.1)
+    np.testing.assert_array_equal(moved, errors.displacements(20_000, 1))
+    assert not np.any(moved == errors.displacements(20_000, 2))
+    scale = PsfErrors.of(("a", "b", "position_scatter"), i, draws @ k.T)
+    assert not np.any(scale.covariance[2]) and np.all(np.diag(scale.covariance)[:2] > 0.0)
+
+
+@pytest.mark.long
+def test_positions_that_scatter_are_sampled_with_a_measured_psf():
+    """Where stars scatter, what is lost to the PSF shrinks too: a constant loss once won over them.
+
+    Then walkers left for a scatter of many times the true one, and a fifth of their moves was
+    accepted.
+    """
+    model, theta, given = frame_of(bf.MoffatPSF(1.2, 4.765), 1.2, side=6)
+    rng = np.random.default_rng(2)
+    s = model.sources
+    moved = bf.SourceCatalog(*(np.stack([s.x, s.y]) + 0.01 * rng.normal(size=(2, len(s)))), s.flux)
+    counts = bf.simulate(replace(model, sources=moved), theta, 5.0, seed=2)
+    nuisances = replace(given.nuisances, position_scatter=True)
+    posterior = bf.Posterior(given.model, counts, nuisances=nuisances)
+    posterior, estimate = bf.measure_psf(posterior, bf.find_map(posterior))
+    chain = bf.sample(posterior, estimate, seed=1, steps=100, progress=False)
+    assert chain.accepted.mean() > 0.5 * 100
+    draws, k = chain.draws(), posterior.parameter_names.index("position_scatter")
+    assert 0.005 < np.median(draws[:, k]) < 0.02
+    raw = chain.chain[:, chain.burn_in :].reshape(draws.shape)
+    added = draws.var(axis=0) / raw.var(axis=0) - 1.0
+    assert added[k] == 0.0 and np.all((added[:4] > 0.01) & (added[:4] < 1.0))
+    claimed = np.sqrt(np.diag(estimate.covariance))[:4]
+    np.testing.assert_allclose(draws.std(axis=0)[:4], claimed, rtol=0.35)
+    assert np.all(np.abs(draws.mean(axis=0)[:4] - theta) < 4.5 * claimed)
 
 
 def varying_model(rng):

@@ -114,7 +114,8 @@ def log_evidence(chain: Chain) -> Evidence:
             return importance_evidence(density, chain.estimate, PROPOSALS, random)[0]
         move = LaplaceMove.of(density, chain.estimate)
         kept = chain.log_prob[:, chain.burn_in :]
-        log_q = move.log_density(chain.draws()).reshape(kept.shape)
+        draws = chain.chain[:, chain.burn_in :].reshape(-1, len(chain.parameter_names))
+        log_q = move.log_density(draws).reshape(kept.shape)
         walkers = (kept - log_q).transpose(0, 2, 1).reshape(-1, kept.shape[1])
         return _bridge(walkers, _proposed(density, move, chain.estimate, PROPOSALS, random))
 

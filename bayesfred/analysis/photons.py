@@ -164,6 +164,8 @@ def laplace_error(posterior: Posterior, params: Floats, points: FieldPoints) -> 
     float, pixel
     """
     covariance = inverse(posterior.information(params))
+    if posterior.psf_errors is not None:
+        covariance = covariance + posterior.psf_errors.covariance
     return field_error(
         points, displacement_covariance(posterior, params, covariance, points.u, points.v)
     )

@@ -82,7 +82,8 @@ def draws(
         )
     # of 300 draws whose correlation is less, ranks spread 0.3 % more
     apart = round(kept[..., 0].size / effective)
-    return np.asarray(kept[:, ::apart].reshape(-1, posterior.n_parameters))
+    every = chain.draws().reshape(kept.shape)
+    return np.asarray(every[:, ::apart].reshape(-1, posterior.n_parameters))
 
 
 def coverage_error(level: float, n: int) -> float:

@@ -20,12 +20,12 @@ from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
-from bayesfred.model.information_loss import InformationLoss
 from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
 from bayesfred.model.pixels import usable_pixels
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.psf_errors import PsfErrors
 
 
 @serializable("posterior")
@@ -52,8 +52,9 @@ class Posterior(TargetDensity):
         Where free fluxes have their maximum near some parameters: `near` makes it.
     valid : array_like of bool, shape (ny, nx), optional
         True where a pixel may be used when the footprint moves; by default `mask`.
-    loss : InformationLoss, optional
-        What the errors of a measured PSF take from the parameters: `marginalize_psf` finds it.
+    psf_errors : PsfErrors, optional
+        What the errors of a measured PSF add to the parameters': `marginalize_psf` finds it.
+        `log_prob` is that with the PSF fixed; `MapEstimate.covariance` and `Chain.draws` have them.
 
     Attributes
     ----------
@@ -66,8 +67,8 @@ class Posterior(TargetDensity):
     InputError
         If the frame does not fit the detector, is in another unit or has other uncertainties, holds
         values that no noise model explains, every pixel is masked, no source lies in the frame, or
-        a prior is unusable; if the extrapolation is of another model, or the loss of other
-        parameters.
+        a prior is unusable; if the extrapolation is of another model, or the errors of a PSF
+        of other parameters.
 
     Examples
     --------
@@ -88,7 +89,7 @@ class Posterior(TargetDensity):
     nuisances: Nuisances
     extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
     valid: Flags = field(metadata={"stored": False})
-    loss: InformationLoss | None = field(metadata={"since": 6})
+    psf_errors: PsfErrors | None = field(metadata={"since": 6})
 
     def __init__(
         self,
@@ -101,7 +102,7 @@ class Posterior(TargetDensity):
         nuisances: Nuisances = Nuisances(),
         extrapolation: FluxExtrapolation | None = None,
         valid: npt.ArrayLike | None = None,
-        loss: InformationLoss | None = None,
+        psf_errors: PsfErrors | None = None,
     ) -> None:
         frame, mask = frame_given(counts, mask, getattr(noise, "variance", None))
         used = usable_pixels(model, frame, mask, noise, nuisances)
@@ -113,14 +114,14 @@ class Posterior(TargetDensity):
             )
         values: tuple[Any, ...] = (
             model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
-            extrapolation, np.array(valid, dtype=bool), loss,
+            extrapolation, np.array(valid, dtype=bool), psf_errors,
         )  # fmt: skip
         for name, value in zip((f.name for f in fields(self)), values, strict=True):
             object.__setattr__(self, name, value)
         object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
-        if loss is not None and loss.names != self.parameter_names:
+        if psf_errors is not None and psf_errors.names != self.parameter_names:
             raise InputError(
-                f"loss: got one of {', '.join(loss.names)}, expected one of "
+                f"psf_errors: got those of {', '.join(psf_errors.names)}, expected those of "
                 f"{', '.join(self.parameter_names)}"
             )
 
@@ -188,8 +189,6 @@ class Posterior(TargetDensity):
         prior = self._log_prior(vectors)
         out = self.likelihood.log_likelihood(vectors, prior > -np.inf)
         out = np.where(out > -np.inf, out + prior, out)
-        if self.loss is not None:
-            out += self.loss.log_factor(vectors)
         out[np.isnan(prior)] = np.nan
         return float(out[0]) if np.ndim(params) == 1 else out
 
@@ -204,8 +203,7 @@ class Posterior(TargetDensity):
         if not np.isfinite(self.log_prior(vector)[0]):
             return np.full(vector.size, np.nan)
         slopes = [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
-        slope = self.likelihood.gradient(vector) + slopes
-        return slope if self.loss is None else slope + self.loss.gradient(vector)
+        return self.likelihood.gradient(vector) + slopes
 
     def fisher(self, params: npt.ArrayLike) -> Floats:
         """Fisher information of the frame about the parameters, free fluxes profiled out.
@@ -221,14 +219,11 @@ class Posterior(TargetDensity):
         return self.likelihood.fisher(vector)
 
     def information(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information plus prior curvature less what is lost, shape (d, d).
+        """Fisher information plus prior curvature, shape (d, d).
 
-        The inverse is the covariance of the Laplace approximation.
+        The inverse is the covariance of the Laplace approximation with the PSF fixed.
         """
-        given = self.fisher(params) + self.prior_information(params)
-        if self.loss is None or not np.isfinite(given).all():
-            return given
-        return self.loss.left_of(given)
+        return self.fisher(params) + self.prior_information(params)
 
     def prior_information(self, params: npt.ArrayLike) -> Floats:
         """Curvature of the prior where it is positive, shape (d, d)."""
@@ -283,7 +278,7 @@ class Posterior(TargetDensity):
             prior.pop("psf_sigma", None)
         model = replace(self.model, psf=psf, detector=detector)
         return replace(
-            self, model=model, prior=prior, nuisances=nuisances, extrapolation=None, loss=None
+            self, model=model, prior=prior, nuisances=nuisances, extrapolation=None, psf_errors=None
         )
 
     def simulate(

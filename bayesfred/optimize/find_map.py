@@ -19,7 +19,7 @@ from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.modes import ModeSearch, find_modes
 from bayesfred.optimize.newton import NewtonResult, maximize
-from bayesfred.optimize.outliers import BREAKDOWN, Kept, keep_all, reject
+from bayesfred.optimize.outliers import BREAKDOWN, COARSE, Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
 
 # The maximum is found where a Newton step from it would move no parameter by more than this share
@@ -173,7 +173,9 @@ def approach(
         if not np.isfinite(posterior.log_prob(params)):
             raise InputError(NO_DENSITY)
         _require_determined(posterior, params, posterior.fisher(params))
-        kept, params, _ = (reject if rejecting else keep_all)(posterior, params)
+        kept = keep_all(posterior, params)[0]
+        if rejecting:  # a PSF that is not the frame's leaves a share of all light
+            kept, params, _ = reject(posterior, params, COARSE)
         top = maximize(kept.posterior, params, steps=STEPS)
         return kept.posterior, _estimate(kept.posterior, top, top.evaluations, "")
 
@@ -196,8 +198,7 @@ def _search(
             if top is None:
                 fisher = posterior.fisher(begun.params)
                 _require_determined(posterior, begun.params, fisher)
-                if posterior.loss is None:
-                    information = fisher + posterior.prior_information(begun.params)
+                information = fisher + posterior.prior_information(begun.params)
             kept, origin, spent = rejecting(posterior, begun.params)
             known = information if origin is begun.params else None
             again = maximize(kept.posterior, origin, information=known)
@@ -274,9 +275,9 @@ def _estimate(
         message = f"not found, {message}: {remedy}"
     else:
         message = f"found, {message}{advice and f'; {advice}'}"
-    return MapEstimate(
-        top.params, top.covariance, top.log_prob, evaluations, message, at_maximum, fits
-    )
+    errors = posterior.psf_errors if isinstance(posterior, Posterior) else None
+    covariance = top.covariance if errors is None else top.covariance + errors.covariance
+    return MapEstimate(top.params, covariance, top.log_prob, evaluations, message, at_maximum, fits)
 
 
 def _advice(fit: Mapping[str, float], enough: bool, rejecting: bool) -> str:

@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
+from scipy import spatial
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
@@ -27,7 +28,7 @@ from bayesfred.imaging.psf.sampled import spline_coefficients
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.psf_equations import WIDTH, PsfEquations, PsfState, field_radius
-from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
+from bayesfred.optimize.psf_levels import NARROWEST, RADIUS, STRENGTH, WINGS, PsfGrid
 from bayesfred.optimize.psf_samples import PsfSamples
 
 KNOTS_PER_WIDTH = 6.0  # at the least: a spline follows any PSF so to 1e-4 of its peak
@@ -38,6 +39,7 @@ STILL = 0.1  # squared standard deviations, of all unknowns together
 LARGEST = 0.4  # change of the PSF in one turn, share of its peak
 DARKEST = 0.1  # of its value that a flux may fall to in one turn
 DRAWS = 100
+DARK = 0.1  # of the pixels are beyond the PSF of every source, where that can be
 WINGS_SEEN = 5.0  # standard deviations of light beyond the fine grid that call for a wider one
 
 
@@ -95,8 +97,9 @@ def fit_psf(
     with threadpool_limits(1, user_api="blas"):
         state = starting_state(posterior, estimate, float(oversampling), degree)
         equations = solved(posterior, state)
-        if _light_beyond(posterior, equations.state) > WINGS_SEEN:
-            equations = solved(posterior, _with_wings(equations.state))
+        wider = _with_wings(posterior, equations.state)
+        if _light_beyond(posterior, wider) > WINGS_SEEN:
+            equations = solved(posterior, wider)
         return _measured(posterior, equations)
 
 
@@ -118,16 +121,22 @@ def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
     InputError
         If no solution is found.
     """
+    known, before, last, share = None, math.inf, None, 1.0
     for turn in range(TURNS):
         # a model error that came first would explain what a PSF too smooth leaves
-        equations = PsfEquations.of(posterior, state, exact=turn < EXACT)
+        equations = PsfEquations.of(posterior, state, exact=turn < EXACT, known=known)
         if turn < CHOOSING:
             equations = equations.with_strengths()
-        lower, scale = equations.factor
-        far = float(np.sum((lower.T @ (equations.step / scale)) ** 2))
-        if turn > EXACT and far < STILL:
+        far = equations.along(equations.step)
+        if turn > EXACT and far < STILL and known is None:
             return equations
-        state = _moved(posterior, equations)
+        # weights follow the light: where that turns a step back, a part of it goes farther
+        if last is not None:
+            share = min(1.0, share / max(1.0 - equations.along(last) / before, 0.5))
+        # information from a state nearby serves while it leads on, but not for the errors
+        leads = turn >= CHOOSING and STILL <= far < before
+        known, before, last = equations if leads else None, far, equations.step
+        state = _moved(posterior, equations, share)
     raise InputError(
         f"psf: no PSF found in {TURNS} turns: expected a start that resembles it: fit the width "
         "first (nuisances: psf_sigma), or begin from another PSF"
@@ -155,7 +164,8 @@ def starting_state(
     pixel = 0.0 if has_pixel(psf) or posterior.model.detector.pixel == "impulse" else 1.0
     width = math.hypot(sigma, pixel / math.sqrt(12.0))
     knots = max(1.0, min(oversampling, oversampling * KNOTS_PER_WIDTH / (4.0 * FWHM * width)))
-    grid = PsfGrid(knots, width, degree, wings=False)
+    radius = min(RADIUS * width, max(NARROWEST * width, _reach(posterior, estimate.params)))
+    grid = PsfGrid(knots, width, degree, radius)
     side = int(grid.levels.side[0])
     x = np.linspace(-0.5, 0.5, side) * ((side - 1) / knots)
     c = spline_coefficients(_pixel_density(psf, psf.sigma / sigma, pixel, x))
@@ -177,8 +187,8 @@ def _pixel_density(psf: PSF, scale: float, pixel: float, x: Floats) -> Floats:
     return out
 
 
-def _moved(posterior: Posterior, equations: PsfEquations) -> PsfState:
-    """The state a step on, or as much of the step as leaves the PSF recognisable."""
+def _moved(posterior: Posterior, equations: PsfEquations, share: float) -> PsfState:
+    """The state a share of a step on, or as much of it as leaves the PSF recognisable."""
     state, step = equations.state, equations.step
     size = state.deviations.size
     change = state.grid.combined(np.concatenate([np.zeros(state.grid.fixed), step[:size]]))
@@ -186,7 +196,7 @@ def _moved(posterior: Posterior, equations: PsfEquations) -> PsfState:
     s = posterior.model.sources
     terms = field_terms(s.x, s.y, state.grid.degree, field_radius(posterior))
     largest = float(np.abs(terms @ change.reshape(len(change), -1)).max())
-    share = min(1.0, LARGEST * peak / max(largest, 1e-300))
+    share = min(share, LARGEST * peak / max(largest, 1e-300))
     index, own, response = equations.eliminated
     every = share * (own - response @ step)
     params = state.params + share * step[size:]
@@ -204,11 +214,23 @@ def _moved(posterior: Posterior, equations: PsfEquations) -> PsfState:
     return replace(state, coefficients=coefficients, params=params, fluxes=fluxes, shifts=shifts)
 
 
+def _reach(posterior: Posterior, params: Floats) -> float:
+    """How far from their sources the PSF may reach and leave pixels that tell the background.
+
+    Where all pixels have light of some source, a pedestal under every star is no different from the
+    background.
+    """
+    images = posterior.likelihood.image_positions(params)
+    ny, nx = posterior.mask.shape
+    pixels = np.argwhere(posterior.mask)[:, ::-1] - 0.5 * np.array([nx - 1, ny - 1])
+    distance, _ = spatial.cKDTree(images[np.isfinite(images).all(axis=1)]).query(pixels)
+    return float(np.quantile(distance, 1.0 - DARK))
+
+
 def _light_beyond(posterior: Posterior, state: PsfState) -> float:
-    """By how many standard deviations light that falls as r^-4 lies beyond the fine grid."""
-    radius = state.grid.radius
-    wide = replace(state.grid, wings=True)
-    data = PsfSamples.at(posterior, state.params, state.shifts, wide.radius)
+    """By how many standard deviations light that falls as r^-4 lies between fine grid and wings."""
+    radius, wings = state.grid.fine_radius, state.grid.wings
+    data = PsfSamples.at(posterior, state.params, state.shifts, wings)
     r2 = data.samples.a**2 + data.samples.b**2
     bright = state.fluxes[data.samples.source]
     wing = data.image(np.where(r2 > radius**2, bright * (radius**2 / r2) ** 2, 0.0))
@@ -220,9 +242,10 @@ def _light_beyond(posterior: Posterior, state: PsfState) -> float:
     return float(weight @ (wing * residual)) / math.sqrt(spread) if spread > 0.0 else 0.0
 
 
-def _with_wings(state: PsfState) -> PsfState:
+def _with_wings(posterior: Posterior, state: PsfState) -> PsfState:
     """The state with a grid for wings, which are none yet."""
-    grid = replace(state.grid, wings=True)
+    wings = min(WINGS * state.grid.sigma, _reach(posterior, state.params))
+    grid = replace(state.grid, wings=max(wings, state.grid.fine_radius))
     more = grid.conventions.shape[1] - state.coefficients.size
     return replace(
         state,

@@ -55,8 +55,8 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     estimate = float(np.mean(residual))
     profiled = posterior.nuisances.profiled * posterior.model.sources.flux.size
     fitted = posterior.n_parameters + profiled
-    if posterior.loss is not None:
-        fitted += round(posterior.loss.absorbed)
+    if posterior.psf_errors is not None:
+        fitted += round(posterior.psf_errors.absorbed)
     noise, sums = posterior.noise_at(params).at(used), np.zeros(7)
     with np.errstate(all="ignore"):  # a mean of zero makes a statistic infinite, which is its value
         # whole frames of intermediate numbers would not fit the caches, or the memory

@@ -1,22 +1,32 @@
 """A posterior with a measured PSF: the PSF, the maximum with it, and what its errors take."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import FWHM, MeasuredPSF
-from bayesfred.model.information_loss import InformationLoss
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_psf import fit_psf
 from bayesfred.optimize.newton import maximize
 
+LEAST_ERROR = 1e-3  # where the search for a model error begins
+
 
 def measure_psf(
-    posterior: Posterior, estimate: MapEstimate, *, oversampling: int = 4, degree: int = 0
+    posterior: Posterior,
+    estimate: MapEstimate,
+    *,
+    oversampling: int = 4,
+    degree: int = 0,
+    model_error: bool = False,
+    prior: Mapping[str, Any] | None = None,
 ) -> tuple[Posterior, MapEstimate]:
     """Measure the PSF of a frame, and maximise the posterior with it.
 
@@ -27,6 +37,11 @@ def measure_psf(
         Its maximum.
     oversampling, degree : int
         As for `fit_psf`.
+    model_error : bool
+        Add the model error to the parameters: what the measured PSF leaves. With a PSF that is not
+        the frame's it would only slow the search.
+    prior : mapping from str to frozen distribution, optional
+        Where this has one of the model error.
 
     Returns
     -------
@@ -56,8 +71,14 @@ def measure_psf(
     """
     psf = fit_psf(posterior, estimate, oversampling=oversampling, degree=degree)
     bare = posterior.with_psf(psf)
-    kept = [posterior.parameter_names.index(name) for name in bare.parameter_names]
-    top = maximize(bare, estimate.params[kept])
+    if model_error:
+        given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
+        bare = replace(
+            bare, nuisances=replace(bare.nuisances, model_error=True), prior={**bare.prior, **given}
+        )
+    known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
+    known.setdefault("model_error", max(psf.model_error, LEAST_ERROR))
+    top = maximize(bare, np.array([known[name] for name in bare.parameter_names]))
     measured = _marginalized(bare, psf, top.params, psf.determined)
     return measured, find_map(measured, top.params)
 
@@ -75,7 +96,7 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
     Returns
     -------
     Posterior
-        With a `loss` about that maximum: find it again, for its covariance.
+        With `psf_errors` about that maximum: find it again, for its covariance.
 
     Raises
     ------
@@ -102,7 +123,7 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
             f"psf: got {type(psf).__name__} without draws, expected a MeasuredPSF with its errors: "
             "fit_psf makes one"
         )
-    return _marginalized(replace(posterior, loss=None), psf, estimate.params, 0.0)
+    return _marginalized(replace(posterior, psf_errors=None), psf, estimate.params, 0.0)
 
 
 def psf_message(posterior: Posterior) -> str:
@@ -119,7 +140,8 @@ def psf_message(posterior: Posterior) -> str:
     """
     psf = posterior.model.psf
     assert isinstance(psf, MeasuredPSF), "one was measured"
-    here = "" if posterior.loss is None or posterior.loss.absorbed else " on another frame"
+    errors = posterior.psf_errors
+    here = "" if errors is None or errors.absorbed else " on another frame"
     varies = f", varying with degree {psf.degree} over the field" if psf.degree else ""
     left = f"{psf.model_error:.1%} of the light unexplained" if psf.model_error else "noise is left"
     return (
@@ -140,6 +162,5 @@ def _marginalized(
     )
     slopes = slopes[np.isfinite(slopes).all(axis=1)]
     information = posterior.information(centre)
-    names = posterior.parameter_names
-    loss = InformationLoss.of(names, centre, information, slopes, absorbed)
-    return replace(posterior, loss=loss)
+    errors = PsfErrors.of(posterior.parameter_names, information, slopes, absorbed)
+    return replace(posterior, psf_errors=errors)

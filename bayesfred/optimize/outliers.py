@@ -80,8 +80,12 @@ def keep_all(posterior: Posterior, params: Floats) -> tuple[Kept, Floats, int]:
     return Kept(posterior, none, none, 0.0), params, 0
 
 
-def reject(posterior: Posterior, params: Floats) -> tuple[Kept, Floats, int]:
+def reject(
+    posterior: Posterior, params: Floats, tolerances: Sequence[float] = TOLERANCES
+) -> tuple[Kept, Floats, int]:
     """Reject and maximise in turns until the same is rejected again.
+
+    With `tolerances` as of `reject_once`.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def reject(posterior: Posterior, params: Floats) -> tuple[Kept, Floats, int]:
     for _ in range(ROUNDS):
         if not np.isfinite(posterior.log_prob(params)):  # folded where a source is missing
             break
-        found = reject_once(posterior, params)
+        found = reject_once(posterior, params, tolerances)
         key = found.missing.tobytes() + found.lost.tobytes()
         if key in seen:
             break
@@ -254,5 +258,5 @@ def _part(posterior: Posterior, missing: Flags, mask: Flags) -> Posterior:
     noise, nuisances = posterior.noise, posterior.nuisances
     return Posterior(
         model, posterior.counts, prior=posterior.prior, noise=noise, mask=mask,
-        nuisances=nuisances, loss=posterior.loss,
+        nuisances=nuisances, psf_errors=posterior.psf_errors,
     )  # fmt: skip

@@ -8,9 +8,10 @@ noise a model error, a share of the light, is added to the variance.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
@@ -21,10 +22,15 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf.measured import field_terms
 from bayesfred.model import priors
-from bayesfred.model.kernels.psf_normal import normal_equations, sample_psf
+from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.psf_levels import LIMITS, PsfGrid
-from bayesfred.optimize.psf_samples import PsfSamples, source_columns, template_products
+from bayesfred.optimize.psf_samples import (
+    PsfSamples,
+    source_columns,
+    template_products,
+    template_pulls,
+)
 
 OUTLYING = 6.0  # standard deviations beyond which a pixel counts less
 PROBES = 40  # draws from which the number of determined coefficients is estimated
@@ -74,6 +80,78 @@ class Eliminated(NamedTuple):
     response: Floats
 
 
+class Pixels(NamedTuple):
+    """The pixels of a frame at a state: what they say of the model's light."""
+
+    data: PsfSamples
+    terms: Floats  # (s, terms) of the field
+    templates: Floats  # (3, samples)
+    weight: Floats
+    score: Floats
+    model_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class PsfInformation:
+    """The information about all unknowns but fluxes and shifts, without the PSF's prior.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (unknowns, unknowns)
+    which : ndarray of int
+        The templates whose fluxes and shifts are eliminated.
+    outer : ndarray, shape (unknowns, eliminated)
+        What they share with the others.
+    response : ndarray, shape (eliminated, unknowns)
+        How they follow the others.
+    solve : callable
+        With their own information.
+    """
+
+    matrix: Floats
+    which: Ints
+    outer: Floats
+    response: Floats
+    solve: Callable[[Floats], Floats]
+
+    @classmethod
+    def of(cls, posterior: Posterior, state: PsfState, pixels: Pixels) -> "PsfInformation":
+        """The information at a state."""
+        data, weight = pixels.data, pixels.weight
+        half, coupling, offset = psf_information(
+            state.grid.unknown, pixels.terms, data.samples,
+            (state.fluxes, weight, data.background), pixels.templates,
+        )  # fmt: skip
+        own, with_background = template_products(data, pixels.templates, weight, len(state.fluxes))
+        columns, select = _acting(posterior, state)
+        mixed = columns.T @ (with_background @ select)
+        inner = columns.T @ (own @ columns) + mixed + mixed.T
+        inner += select.T @ (data.background.T @ (weight[:, None] * data.background)) @ select
+        inner += posterior.prior_information(state.params)
+        idle = np.diag(inner) <= 0.0
+        inner[idle, idle] = 1.0
+        size = len(half)
+        joint = np.empty((size + len(inner), size + len(inner)))
+        joint[:size, :size] = half
+        joint[:size, :size] += half.T
+        joint[:size, size:] = coupling.T @ columns + offset @ select
+        joint[size:, :size] = joint[:size, size:].T
+        joint[size:, size:] = inner
+        free = np.zeros((len(state.fluxes), 3), bool)
+        free[:, 0] = posterior.nuisances.flux == "free"
+        free[:, 1:] = posterior.nuisances.position_scatter
+        which = np.flatnonzero(free.ravel() & (own.diagonal() > 0.0))
+        if not which.size:
+            return cls(joint, which, np.zeros((len(joint), 0)), np.zeros((0, len(joint))), np.copy)
+        precision = _shift_precision(posterior, state)[which]
+        solve = splu((own[which][:, which] + sparse.diags_array(precision)).tocsc()).solve
+        shared = columns.T @ own[:, which] + (with_background[which] @ select).T
+        outer = np.concatenate([coupling[which].T, shared])
+        response = solve(outer.T)
+        joint -= outer @ response
+        return cls(joint, which, outer, response, solve)
+
+
 @dataclass(frozen=True, eq=False)
 class PsfEquations:
     """The equations of one step from a state.
@@ -81,8 +159,7 @@ class PsfEquations:
     Attributes
     ----------
     state : PsfState
-    information : ndarray, shape (unknowns, unknowns)
-        Without the PSF's prior.
+    information : PsfInformation
     pull : ndarray, shape (unknowns,)
         The slope of the log-likelihood and the parameters' priors.
     eliminated : Eliminated
@@ -91,39 +168,45 @@ class PsfEquations:
     """
 
     state: PsfState
-    information: Floats
+    information: PsfInformation
     pull: Floats
     eliminated: Eliminated
     model_error: float
 
     @classmethod
-    def of(cls, posterior: Posterior, state: PsfState, *, exact: bool = False) -> "PsfEquations":
-        """The equations at a state, for a frame; an exact model has no error of its own."""
-        grid, params, fluxes = state.grid, state.params, state.fluxes
-        sources = posterior.model.sources
-        data = PsfSamples.at(posterior, params, state.shifts, grid.radius)
-        seen = int(np.sum(np.diff(data.samples.first) > 0))
-        if seen <= len(params) + 10:
-            raise InputError(
-                f"psf: got {seen} pixels that see a source, expected more: widen the "
-                "footprint or the mask"
-            )
-        terms = field_terms(sources.x, sources.y, grid.degree, field_radius(posterior))
-        p = sample_psf(grid.levels, terms, data.samples, state.coefficients)
-        bright = fluxes[data.samples.source]
-        templates = data.samples.size * np.stack([p[0], -bright * p[1], -bright * p[2]])
-        light = data.image(bright * templates[0])
-        residual, variance = data.residual(posterior, params, light)
-        error = 0.0 if exact else _model_error(residual, variance, light)
-        variance = variance + (error * light) ** 2
-        weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * OUTLYING**2)))
-        pixels = fluxes, weight, residual, data.background
-        psf = normal_equations(grid.unknown, terms, data.samples, pixels, templates)
-        own = template_products(data, templates, weight, residual, len(fluxes))
-        squares = data.background.T @ (weight[:, None] * data.background)
-        background = squares, data.background.T @ (weight * residual)
-        joined = _joined(posterior, state, psf, own, background)
-        return cls(state, *joined, error)
+    def of(
+        cls,
+        posterior: Posterior,
+        state: PsfState,
+        *,
+        exact: bool = False,
+        known: "PsfEquations | None" = None,
+    ) -> "PsfEquations":
+        """The equations at a state, for a frame; an exact model has no error of its own.
+
+        With equations that are `known` at a state nearby their information serves once more.
+        """
+        pixels = _pixels(posterior, state, exact)
+        data, score = pixels.data, pixels.score
+        information = known.information if known else PsfInformation.of(posterior, state, pixels)
+        psf = psf_slope(state.grid.unknown, pixels.terms, data.samples, state.fluxes, score)
+        own = template_pulls(data, pixels.templates, score, len(state.fluxes))
+        columns, select = _acting(posterior, state)
+        inner = columns.T @ own + select.T @ (data.background.T @ score)
+        given = zip(posterior.prior.values(), state.params, strict=True)
+        inner += [priors.slope(prior, x)[0] for prior, x in given]
+        inner[[name in HELD for name in posterior.parameter_names]] = 0.0
+        shifts = np.column_stack([state.fluxes, state.shifts]).ravel()
+        own -= _shift_precision(posterior, state) * shifts
+        step = information.solve(own[information.which])
+        pull = np.concatenate([psf, inner]) - information.outer @ step
+        out = cls(
+            state, information, pull,
+            Eliminated(information.which, step, information.response), pixels.model_error,
+        )  # fmt: skip
+        if known and known.state.strengths is state.strengths:
+            out.__dict__["factor"] = known.factor
+        return out
 
     @cached_property
     def conventions(self) -> Floats:
@@ -134,7 +217,7 @@ class PsfEquations:
     @cached_property
     def factor(self) -> tuple[Floats, Floats]:
         """Cholesky's factor of the information with the priors, and the unknowns' scales."""
-        matrix = self.information.copy()
+        matrix = self.information.matrix.copy()
         for block, strength in zip(self.state.grid.blocks, self.state.strengths, strict=True):
             n = np.arange(len(matrix))[block.where]
             entries = block.roughness.tocoo()
@@ -170,6 +253,11 @@ class PsfEquations:
         target[0] += 1.0
         return self._constrained(free, target)
 
+    def along(self, other: Floats) -> float:
+        """The product of the step with another, in standard deviations of all unknowns together."""
+        lower, scale = self.factor
+        return float((lower.T @ (self.step / scale)) @ (lower.T @ (other / scale)))
+
     def draws(self, number: int) -> Floats:
         """Draws from the posterior of all unknowns, less its maximum, a column each."""
         lower, scale = self.factor
@@ -202,55 +290,40 @@ def field_radius(posterior: Posterior) -> float:
     return 0.5 * math.hypot(*posterior.model.detector.fine_shape)
 
 
-def _joined(
-    posterior: Posterior,
-    state: PsfState,
-    psf: tuple[Floats, Floats, Floats],
-    own: tuple[Any, Floats, Floats],
-    background: tuple[Floats, Floats],
-) -> tuple[Floats, Floats, Eliminated]:
-    """Information and pull of coefficients and parameters, fluxes and shifts eliminated."""
-    half, coupling, others = psf
-    matrix, offset, pull = half + half.T, others[:, :-1], others[:, -1]
-    templates, with_background, own_pull = own
-    columns = source_columns(posterior, state.params, state.fluxes)
+def _pixels(posterior: Posterior, state: PsfState, exact: bool) -> Pixels:
+    grid, fluxes, sources = state.grid, state.fluxes, posterior.model.sources
+    data = PsfSamples.at(posterior, state.params, state.shifts, grid.radius)
+    seen = int(np.sum(np.diff(data.samples.first) > 0))
+    if seen <= len(state.params) + 10:
+        raise InputError(
+            f"psf: got {seen} pixels that see a source, expected more: widen the footprint or the "
+            "mask"
+        )
+    terms = field_terms(sources.x, sources.y, grid.degree, field_radius(posterior))
+    p = sample_psf(grid.levels, terms, data.samples, state.coefficients)
+    bright = fluxes[data.samples.source]
+    templates = data.samples.size * np.stack([p[0], -bright * p[1], -bright * p[2]])
+    light = data.image(bright * templates[0])
+    residual, variance = data.residual(posterior, state.params, light)
+    error = 0.0 if exact else _model_error(residual, variance, light)
+    variance = variance + (error * light) ** 2
+    weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * OUTLYING**2)))
+    return Pixels(data, terms, templates, weight, weight * residual, error)
+
+
+def _acting(posterior: Posterior, state: PsfState) -> tuple[Floats, Floats]:
+    """How the parameters act on the templates, and which are the background's terms."""
     levels = [k for k, p in enumerate(posterior.parameters) if p.kind == "background"]
-    select = np.eye(posterior.n_parameters)[levels]
-    mixed = columns.T @ (with_background @ select)
-    inner = columns.T @ (templates @ columns) + mixed + mixed.T
-    inner += select.T @ background[0] @ select + posterior.prior_information(state.params)
-    idle = np.diag(inner) <= 0.0
-    inner[idle, idle] = 1.0
-    given = zip(posterior.prior.values(), state.params, strict=True)
-    inner_pull = columns.T @ own_pull + select.T @ background[1]
-    inner_pull += [priors.slope(prior, x)[0] for prior, x in given]
-    inner_pull[[name in HELD for name in posterior.parameter_names]] = 0.0
-    cross = coupling.T @ columns + offset @ select
-    joint = np.block([[matrix, cross], [cross.T, inner]])
-    joint_pull = np.concatenate([pull, inner_pull])
-    free = np.zeros((len(state.fluxes), 3), bool)
-    free[:, 0] = posterior.nuisances.flux == "free"
-    free[:, 1:] = posterior.nuisances.position_scatter
-    index = np.flatnonzero(free.ravel() & (templates.diagonal() > 0.0))
-    if not index.size:
-        nothing = Eliminated(index, np.zeros(0), np.zeros((0, len(joint_pull))))
-        return joint, joint_pull, nothing
-    precision, own_pull = np.zeros(index.size), own_pull[index].copy()
+    columns = source_columns(posterior, state.params, state.fluxes)
+    return columns, np.eye(posterior.n_parameters)[levels]
+
+
+def _shift_precision(posterior: Posterior, state: PsfState) -> Floats:
+    """The prior's, of every template: 0 of fluxes."""
+    out = np.zeros((len(state.fluxes), 3))
     if posterior.nuisances.position_scatter:
-        precision[index % 3 > 0] = _scatter(posterior, state.params) ** -2.0
-        shifts = np.column_stack([state.fluxes, state.shifts]).ravel()[index]
-        own_pull -= precision * shifts
-    solver = splu((templates[index][:, index] + sparse.diags_array(precision)).tocsc())
-    shared = columns.T @ templates[:, index] + (with_background[index] @ select).T
-    outer = np.concatenate([coupling[index].T, shared])
-    eliminated = Eliminated(index, solver.solve(own_pull), solver.solve(outer.T))
-    joint -= outer @ eliminated.response
-    joint_pull -= outer @ eliminated.step
-    return joint, joint_pull, eliminated
-
-
-def _scatter(posterior: Posterior, params: Floats) -> float:
-    return float(params[posterior.parameter_names.index(SCATTER)])
+        out[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
+    return out.ravel()
 
 
 def _model_error(residual: Floats, variance: Floats, light: Floats) -> float:

@@ -2,7 +2,7 @@
 
 The start's spline c0 is kept, and deviations from it are looked for on two grids: a fine one for
 the PSF at the field's middle, and one twice as coarse, whose splines are exact sums of finer ones,
-for its variation over the field. A third one, four times as coarse and three times as wide, is for
+for its variation over the field. A third one, eight times as coarse and three times as wide, is for
 wings that the fine one cannot hold.
 
 Before the counts speak, a block of deviations (a grid and a term of the field) is a smooth function
@@ -30,6 +30,7 @@ from bayesfred.model.kernels.psf_normal import Levels
 RADIUS = 7.0  # of the fine grid, widths of the PSF
 FIELD_RADIUS = 5.0  # of the grid for the variation over the field
 WINGS = 21.0  # of the grid for wings
+NARROWEST = 4.0  # of the fine grid where stars leave no pixels between them
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
 STRENGTH = 100.0  # to begin with
 LIMITS = (1e-3, 1e9)  # of a strength
@@ -55,29 +56,32 @@ class PsfGrid:
         Width of the start.
     degree : int
         Of the variation over the field.
-    wings : bool
-        Whether there is a grid for wings.
+    fine_radius : float, pixel
+        Of the fine grid.
+    wings : float, pixel
+        Radius of the grid for wings; 0 where there is none.
     """
 
     oversampling: float
     sigma: float
     degree: int
-    wings: bool
+    fine_radius: float
+    wings: float = 0.0
 
     @property
     def radius(self) -> float:
         """Distance from the middle that the grids cover, pixel."""
-        return (WINGS if self.wings else RADIUS) * self.sigma
+        return max(self.wings, self.fine_radius)
 
     @cached_property
     def levels(self) -> Levels:
         """The grids as the compiled loops need them: start, fine, then coarser ones."""
         terms = len(field_powers(self.degree))
-        rows = [(1, RADIUS * self.sigma, 0, 1), (1, RADIUS * self.sigma, 0, 1)]
+        rows = [(1, self.fine_radius, 0, 1), (1, self.fine_radius, 0, 1)]
         if terms > 1:
-            rows.append((2, FIELD_RADIUS * self.sigma, 1, terms))
+            rows.append((2, min(FIELD_RADIUS * self.sigma, self.fine_radius), 1, terms))
         if self.wings:
-            rows.append((4, self.radius, 0, 1))
+            rows.append((8, self.wings, 0, 1))
         h = np.array([times / self.oversampling for times, *_ in rows])
         side = np.array(
             [2 * round(radius / step) + 1 for step, (_, radius, *_) in zip(h, rows, strict=True)]

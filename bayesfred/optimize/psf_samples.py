@@ -6,12 +6,12 @@ import numpy as np
 from scipy import sparse
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.model.kernels.psf_normal import SourceSamples
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.model.kernels.psf_samples import SourceSamples, find_samples
 from bayesfred.model.parameters import BACKGROUND_POWERS, displacing
 from bayesfred.model.posterior import Posterior
 
 DIMMEST = 1e-3  # counts that a pixel expects at the least: splines swing below zero
-LARGEST_SCALE = 1.25  # a window is so much larger than the PSF, for images that are magnified
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,44 +57,24 @@ class PsfSamples:
         -------
         PsfSamples
         """
-        model = posterior.model
+        model, mask = posterior.model, posterior.mask
+        s, (ny, nx) = model.sources, mask.shape
         theta, offset = displacing(posterior.parameters, params)
-        d, s = model.polynomial, model.sources
-        ny, nx = model.detector.shape
-        middle = 0.5 * np.array([nx - 1, ny - 1])
+        theta = model.polynomial.monomial_coefficients(theta.copy())
         imaged = posterior.likelihood.image_positions(params) + shifts
-        half = int(np.ceil(LARGEST_SCALE * radius))
-        steps = np.arange(-half, half + 1)
-        known = np.asarray(np.isfinite(imaged).all(axis=1))
-        nearest = np.round(np.where(known[:, None], imaged, 0.0) + middle).astype(np.int64)
-        columns = nearest[:, 0, None, None] + steps
-        rows = nearest[:, 1, None, None] + steps[:, None]
-        columns, rows = np.broadcast_arrays(columns, rows)
-        inside = (columns >= 0) & (columns < nx) & (rows >= 0) & (rows < ny)
-        inside &= known[:, None, None]
-        inside[inside] = posterior.mask[rows[inside], columns[inside]]
-        source = np.nonzero(inside)[0]
-        column, row = columns[inside], rows[inside]
-        u, v = column - middle[0], row - middle[1]
-        x, y = s.x[source], s.y[source]
-        f, g = d.displacement(theta, u, v, x, y)
-        a, b = u - x + f - offset[0] - shifts[source, 0], v - y + g - offset[1] - shifts[source, 1]
-        near = a**2 + b**2 <= radius**2
-        pixel = (row * nx + column)[near]
-        order = np.argsort(pixel, kind="stable")
-        numbers, first = np.unique(pixel[order], return_index=True)
-        near = np.flatnonzero(near)[order]
-        size = np.ones(near.size)
-        if model.conserve_flux:
-            size = np.abs(d.determinant(theta, u[near], v[near], x[near], y[near]))
-        first = np.append(first, near.size)
-        dark = posterior.mask.ravel().copy()
+        first, numbers, samples = find_samples(
+            (_map_coefficients(model.polynomial, theta, s.x, s.y, offset, axis=0),
+             _map_coefficients(model.polynomial, theta, s.x, s.y, offset, axis=1)),
+            imaged, shifts, mask, radius, model.conserve_flux,
+        )  # fmt: skip
+        dark = mask.ravel().copy()
         dark[numbers] = False
         beyond = np.flatnonzero(dark)
         numbers = np.append(numbers, beyond)
         first = np.append(first, np.full(beyond.size, first[-1]))
-        samples = SourceSamples(first, source[near], a[near], b[near], size)
+        samples = SourceSamples(first, *samples)
         owner = np.repeat(np.arange(numbers.size), np.diff(first))
+        middle = 0.5 * np.array([nx - 1, ny - 1])
         free = [p.slot for p in posterior.parameters if p.kind == "background"]
         powers = [BACKGROUND_POWERS[slot] for slot in free]
         s_u, s_v = (numbers % nx - middle[0]) * 2 / nx, (numbers // nx - middle[1]) * 2 / ny
@@ -115,6 +95,27 @@ class PsfSamples:
     def image(self, values: Floats) -> Floats:
         """The sum over every pixel's samples, shape (pixels,)."""
         return np.asarray(np.bincount(self.owner, values, self.pixel.size), dtype=np.float64)
+
+
+def _map_coefficients(
+    distortion: PolynomialDistortion,
+    theta: Floats,
+    x: Floats,
+    y: Floats,
+    offset: Floats,
+    *,
+    axis: int,
+) -> Floats:
+    """a of every source in powers of u and v, shape (s, n, n); or b, along axis 1."""
+    first = len(distortion.f_terms)
+    terms = (distortion.g_terms, theta[first:]) if axis else (distortion.f_terms, theta[:first])
+    every = distortion.f_terms + distortion.g_terms
+    out = np.zeros((x.size, *(max(1, max(m + n for _, _, m, n in every)) + 1,) * 2))
+    out[:, 0, 0] = -(y if axis else x) - offset[axis]
+    out[:, 1 - axis, axis] = 1.0
+    for (i, j, m, n), coefficient in zip(*terms, strict=True):
+        out[:, m, n] += coefficient * x**i * y**j
+    return out
 
 
 def source_columns(posterior: Posterior, params: Floats, fluxes: Floats) -> Floats:
@@ -150,15 +151,15 @@ def source_columns(posterior: Posterior, params: Floats, fluxes: Floats) -> Floa
 
 
 def template_products(
-    data: PsfSamples, templates: Floats, weight: Floats, residual: Floats, sources: int
-) -> tuple[sparse.csc_array, Floats, Floats]:
-    """The templates' information, shape (3 s, 3 s), with the background, and their pull.
+    data: PsfSamples, templates: Floats, weight: Floats, sources: int
+) -> tuple[sparse.csc_array, Floats]:
+    """The templates' information, shape (3 s, 3 s), and what they share with the background.
 
     Parameters
     ----------
     data : PsfSamples
     templates : ndarray, shape (3, samples)
-    weight, residual : ndarray, shape (pixels,)
+    weight : ndarray, shape (pixels,)
     sources : int
         How many there are in the catalogue.
 
@@ -166,12 +167,31 @@ def template_products(
     -------
     information : sparse array, shape (3 s, 3 s)
     coupling : ndarray, shape (3 s, terms)
-    pull : ndarray, shape (3 s,)
     """
     source = data.samples.source
     columns = np.concatenate([3 * source + k for k in range(3)])
-    size = 3 * sources
     rows = np.tile(data.owner, 3)
-    design = sparse.csr_array((templates.ravel(), (rows, columns)), (data.pixel.size, size))
+    shape = data.pixel.size, 3 * sources
+    design = sparse.csr_array((templates.ravel(), (rows, columns)), shape)
     weighed = (design.multiply(weight[:, None])).tocsr()
-    return (design.T @ weighed).tocsc(), weighed.T @ data.background, weighed.T @ residual
+    return (design.T @ weighed).tocsc(), weighed.T @ data.background
+
+
+def template_pulls(data: PsfSamples, templates: Floats, score: Floats, sources: int) -> Floats:
+    """The slope of the log-likelihood by every template, shape (3 s,), given that by every pixel.
+
+    Parameters
+    ----------
+    data : PsfSamples
+    templates : ndarray, shape (3, samples)
+    score : ndarray, shape (pixels,)
+    sources : int
+        How many there are in the catalogue.
+
+    Returns
+    -------
+    ndarray, shape (3 s,)
+    """
+    source, each = data.samples.source, score[data.owner]
+    pulls = [np.bincount(source, template * each, sources) for template in templates]
+    return np.asarray(np.stack(pulls, axis=1).ravel(), dtype=np.float64)

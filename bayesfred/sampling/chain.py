@@ -89,8 +89,13 @@ class Chain:
         return self.density
 
     def draws(self) -> Floats:
-        """All draws after burn-in, shape (n, d), parameter units."""
-        return self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
+        """All draws after burn-in, shape (n, d), parameter units.
+
+        Where the PSF was measured its errors are in them: those of the sampler have the PSF fixed.
+        """
+        kept = self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
+        errors = getattr(self.density, "psf_errors", None)
+        return kept if errors is None else kept + errors.displacements(len(kept), self.seed)
 
     def summary(self) -> Table:
         """What the draws say of every parameter, a row each, see `summary.summary`."""

@@ -83,7 +83,7 @@ def to_datatree(chain: "Chain", *, log_likelihood: bool = False) -> xr.DataTree:
     """
     kept = chain.chain[:, chain.burn_in :]
     order = _order(*kept.shape[1:3])
-    draws = kept.reshape(len(kept), -1, kept.shape[3])[:, order]
+    draws = chain.draws().reshape(len(kept), -1, kept.shape[3])[:, order]
     log_prob = chain.log_prob[:, chain.burn_in :].reshape(len(kept), -1)[:, order]
     groups: dict[str, Any] = {
         "posterior": {name: draws[..., k] for k, name in enumerate(chain.parameter_names)},

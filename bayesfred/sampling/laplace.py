@@ -181,7 +181,7 @@ def importance_efficiency(chain: Chain) -> float:
     >>> importance_efficiency(laplace(posterior, seed=1, progress=False)) > 0.99
     True
     """
-    draws, log_q = chain.draws(), chain.log_prob.ravel()
+    draws, log_q = chain.chain.reshape(-1, len(chain.parameter_names)), chain.log_prob.ravel()
     chosen = np.linspace(0, len(draws) - 1, min(WEIGHTED, len(draws))).astype(int)
     log_weights = chain.density.log_prob(draws[chosen]) - log_q[chosen]
     log_weights = np.where(log_weights < np.inf, log_weights, -np.inf)

@@ -153,6 +153,9 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         modes, parts = estimate.mixture, []
         for k, weight in enumerate(modes.weights):
             mean, covariance = modes.means[k], modes.covariances[k]
+            errors = getattr(posterior, "psf_errors", None)
+            if errors is not None and estimate.modes is None:  # which log_prob has not
+                covariance = covariance - errors.covariance
             if posterior.hyperparameters and k < modes.count:
                 # too wide in tau is harmless; without a heavy share it stands for the posterior
                 width = 1.0 if heavy_share else 0.5

@@ -12,6 +12,7 @@ light as it is shifted along a and along b. The distortion's coefficients act th
 the equations hold for them too.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,9 @@ from bayesfred.imaging.kernels.fastmath import FAST
 
 KNOTS = 16  # B-splines that are not zero at a point
 TEMPLATES = 3
+NEAR = 7  # columns on which B-splines overlap one
+TOGETHER = 64  # sources
+LINES = 4096  # pixels
 
 
 class Levels(NamedTuple):
@@ -32,16 +36,6 @@ class Levels(NamedTuple):
     low: Ints  # (l,) first term of the field
     high: Ints  # (l,) the term after the last
     spacing: Floats  # (l,) pixel
-
-
-class SourceSamples(NamedTuple):
-    """Pairs of sources and pixels, sorted by pixel."""
-
-    first: Ints  # (pixels + 1,) samples of pixel i are those from first[i] to first[i + 1]
-    source: Ints  # (samples,)
-    a: Floats  # (samples,) pixel, from the middle of the source's image
-    b: Floats
-    size: Floats  # (samples,) |D|, or 1 where flux is not conserved
 
 
 @inner()
@@ -83,10 +77,18 @@ def sample_psf(levels, field, samples, coefficients):
     return out
 
 
+@inner()
+def _wide(levels):
+    """The number of the level of wings, which comes last; of levels where there is none."""
+    last = levels.side.size - 1
+    return last if last > 0 and levels.low[last] == 0 else last + 1
+
+
 class _Runs(NamedTuple):
     """The coefficients that one pixel depends on, as runs of neighbouring ones."""
 
     begin: Ints  # a run's first coefficient
+    sample: Ints  # the sample that a run of a level that varies is of; -1 of other levels
     first: Ints  # (runs + 1,) where its values begin
     values: Floats  # derivatives of the pixel's expected counts
 
@@ -98,9 +100,9 @@ def _add_runs(levels, samples, n, scaled, runs, size):
     Knots along a come one after the other, and a knot's terms within it, so each of a level's four
     rows of knots is one run.
     """
-    begin, first, values = runs
+    begin, first, values = runs.begin, runs.first, runs.values
     wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
-    for level in range(levels.side.size):
+    for level in range(_wide(levels)):
         side, h = levels.side[level], levels.spacing[level]
         low, terms = levels.low[level], levels.high[level] - levels.low[level]
         i = _splines(samples.a[n] / h, side, wx, spare)
@@ -110,6 +112,7 @@ def _add_runs(levels, samples, n, scaled, runs, size):
             continue
         for q in range(max(0, -j), min(4, side - j)):
             begin[size] = levels.start[level] + ((j + q) * side + i + left) * terms
+            runs.sample[size] = n if low > 0 else -1
             at = first[size]
             for p in range(left, right):
                 weight = wx[p] * wy[q]
@@ -123,26 +126,28 @@ def _add_runs(levels, samples, n, scaled, runs, size):
 
 @inner(fastmath=FAST)
 def _add_square(runs, size, weight, matrix):
-    """Add weight times the runs' outer product: of two runs once, of one with itself half."""
-    begin, first, values = runs
+    """Add weight times the runs' outer product: of two runs once, of one with itself half.
+
+    Runs of one sample in a level that varies are left out, see `_add_variation`.
+    """
+    begin, sample, first, values = runs
     for r in range(size):
         for k in range(first[r], first[r + 1]):
             line, value = matrix[begin[r] + k - first[r]], weight * values[k]
-            own = line[begin[r] : begin[r] + first[r + 1] - first[r]]
-            half = 0.5 * value
-            for o in range(own.size):
-                own[o] += half * values[first[r] + o]
-            for other in range(r + 1, size):
+            for other in range(r, size):
+                if sample[r] >= 0 and sample[r] == sample[other]:
+                    continue
+                share = value if other > r else 0.5 * value
                 at, length = first[other], first[other + 1] - first[other]
                 target = line[begin[other] : begin[other] + length]
                 for o in range(length):
-                    target[o] += value * values[at + o]
+                    target[o] += share * values[at + o]
 
 
 @inner(fastmath=FAST)
 def _add_columns(runs, size, columns, target):
     """Add to the columns of target, at the runs' rows, the runs times a pixel's numbers."""
-    begin, first, values = runs
+    begin, first, values = runs.begin, runs.first, runs.values
     for r in range(size):
         for k in range(first[r], first[r + 1]):
             line, value = target[begin[r] + k - first[r]], values[k]
@@ -153,7 +158,7 @@ def _add_columns(runs, size, columns, target):
 @inner(fastmath=FAST)
 def _add_row(runs, size, factor, target):
     """Add to target, at the runs' places, the runs times a factor."""
-    begin, first, values = runs
+    begin, first, values = runs.begin, runs.first, runs.values
     for r in range(size):
         at, length = first[r], first[r + 1] - first[r]
         own = target[begin[r] : begin[r] + length]
@@ -161,45 +166,227 @@ def _add_row(runs, size, factor, target):
             own[o] += factor * values[at + o]
 
 
-@entry()
-def normal_equations(levels, field, samples, pixels, templates):
-    """The equations of all coefficients, beside the templates and the background's terms.
+@inner()
+def _by_source(samples, sources):
+    """The samples of every source one after the other, and where each source's begin."""
+    first = np.zeros(sources + 1, np.int64)
+    for s in samples.source:
+        first[s + 1] += 1
+    first = np.cumsum(first)
+    order, at = np.empty(samples.source.size, np.int64), first[:-1].copy()
+    for n in range(order.size):
+        s = samples.source[n]
+        order[at[s]] = n
+        at[s] += 1
+    return order, first
 
-    `pixels` are the flux of every source, and of every pixel the weight, the residual and the
-    background's terms; `templates` has shape (3, samples). Returns the matrix of the coefficients,
-    shape (c, c), of which the sum with its transpose is the information; the couplings with the
-    templates, shape (3 sources, c); and with the background's terms and the residuals, shape
-    (c, terms + 1).
+
+@inner(fastmath=FAST)
+def _add_gram(samples, n, grid, weight, gram):
+    """Add weight times the outer product of the B-splines at a sample, of knots of one grid.
+
+    `gram` has a row for every knot, of the knots up to three rows and columns on.
     """
-    flux, weight, residual, background = pixels
-    last, terms = levels.side.size - 1, background.shape[1]
-    total = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
-    matrix, others = np.zeros((total, total)), np.zeros((total, terms + 1))
-    coupling = np.zeros((TEMPLATES * flux.size, total))
-    crowd, width = 1, 0
+    side, h = grid
+    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
+    i = _splines(samples.a[n] / h, side, wx, spare)
+    j = _splines(samples.b[n] / h, side, wy, spare)
+    left, right, bottom = max(0, -i), min(4, side - i), min(4, side - j)
+    for q in range(max(0, -j), bottom):
+        for p in range(left, right):
+            line = gram[(j + q) * side + i + p]
+            own = weight * wx[p] * wy[q]
+            line[NEAR // 2] += 0.5 * own * wx[p] * wy[q]
+            for o in range(p + 1, right):
+                line[NEAR // 2 + o - p] += own * wx[o] * wy[q]
+            for r in range(q + 1, bottom):
+                for o in range(left, right):
+                    line[(r - q) * NEAR + NEAR // 2 + o - p] += own * wx[o] * wy[r]
+
+
+@inner(fastmath=FAST)
+def _add_line(factor, line, target):
+    """Add to target a line times a factor."""
+    for o in range(line.size):
+        target[o] += factor * line[o]
+
+
+@inner()
+def _add_wings(levels, samples, flux, i, out):
+    """Add the B-splines of pixel i in the level of wings, times the light; all knots' values."""
+    level = _wide(levels)
+    side, h = levels.side[level], levels.spacing[level]
+    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
+    for n in range(samples.first[i], samples.first[i + 1]):
+        light = flux[samples.source[n]] * samples.size[n]
+        column = _splines(samples.a[n] / h, side, wx, spare)
+        row = _splines(samples.b[n] / h, side, wy, spare)
+        for q in range(max(0, -row), min(4, side - row)):
+            for p in range(max(0, -column), min(4, side - column)):
+                out[(row + q) * side + column + p] += light * wx[p] * wy[q]
+
+
+@inner()
+def _add_variation(levels, field, samples, flux, weight, matrix):
+    """Add what the level that varies over the field shares with itself, sample by sample.
+
+    And with the wings. Within a source the terms of the field are constant, so its samples make one
+    matrix of knots, which is multiplied by the terms' products; those of many sources at once are a
+    matrix product.
+    """
+    side, h, start = levels.side[1], levels.spacing[1], levels.start[1]
+    low, high = levels.low[1], levels.high[1]
+    terms, sources, knots = high - low, field.shape[0], side * side
+    owner = np.empty(samples.source.size, np.int64)
     for i in range(weight.size):
+        owner[samples.first[i] : samples.first[i + 1]] = i
+    order, first = _by_source(samples, sources)
+    wings = matrix.shape[0] - levels.start[2] if levels.side.size > 2 else 0
+    total, wide = np.zeros((knots * 4 * NEAR, terms * terms)), np.zeros((terms, knots * wings))
+    grams, products = np.empty((TOGETHER, knots, 4 * NEAR)), np.empty((TOGETHER, terms * terms))
+    crosses, line = np.empty((TOGETHER, knots, wings)), np.empty(wings)
+    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
+    for begin in range(0, sources, TOGETHER):
+        some = min(TOGETHER, sources - begin)
+        grams[:some], crosses[:some] = 0.0, 0.0
+        for m in range(some):
+            s = begin + m
+            for n in order[first[s] : first[s + 1]]:
+                light = flux[s] * samples.size[n]
+                _add_gram(samples, n, (side, h), weight[owner[n]] * light**2, grams[m])
+                if wings == 0:
+                    continue
+                i, j = (
+                    _splines(samples.a[n] / h, side, wx, spare),
+                    _splines(samples.b[n] / h, side, wy, spare),
+                )
+                if i <= -4 or j <= -4 or i >= side or j >= side:
+                    continue
+                line[:] = 0.0
+                _add_wings(levels, samples, flux, owner[n], line)
+                for q in range(max(0, -j), min(4, side - j)):
+                    for p in range(max(0, -i), min(4, side - i)):
+                        share = weight[owner[n]] * light * wx[p] * wy[q]
+                        _add_line(share, line, crosses[m, (j + q) * side + i + p])
+            for t in range(terms):
+                products[m, t * terms : (t + 1) * terms] = field[s, low + t] * field[s, low:high]
+        total += np.dot(grams.reshape(TOGETHER, -1)[:some].T, products[:some])
+        own = np.ascontiguousarray(field[begin : begin + some, low:high].T)
+        if wings > 0:
+            wide += np.dot(own, crosses.reshape(TOGETHER, -1)[:some])
+    for knot in range(knots):
+        for o in range(4 * NEAR):
+            i, j = knot % side + o % NEAR - NEAR // 2, knot // side + o // NEAR
+            if 0 <= i < side and j < side:
+                row, column = start + knot * terms, start + (j * side + i) * terms
+                both = total[knot * 4 * NEAR + o]
+                for t in range(terms):
+                    matrix[row + t, column : column + terms] += both[t * terms : (t + 1) * terms]
+        for t in range(terms):
+            own = wide[t, knot * wings : (knot + 1) * wings]
+            matrix[start + knot * terms + t, matrix.shape[0] - wings :] += own
+
+
+@inner()
+def _room(levels, samples, pixels):
+    """Runs with room for those of any pixel."""
+    crowd, width = 1, 0
+    for i in range(pixels):
         crowd = max(crowd, samples.first[i + 1] - samples.first[i])
     for level in range(levels.side.size):
         width += KNOTS * (levels.high[level] - levels.low[level])
     most = crowd * 4 * levels.side.size
-    runs = _Runs(np.empty(most, np.int64), np.zeros(most + 1, np.int64), np.empty(crowd * width))
-    columns, scaled = np.empty(terms + 1), np.empty(field.shape[1])
+    return _Runs(
+        np.empty(most, np.int64), np.empty(most, np.int64), np.zeros(most + 1, np.int64),
+        np.empty(crowd * width),
+    )  # fmt: skip
+
+
+@inner()
+def _runs_of(grids, samples, flux, i, runs, scaled):
+    """Fill the runs of pixel i, given levels and field; returns their number."""
+    (levels, field), size = grids, 0
+    for n in range(samples.first[i], samples.first[i + 1]):
+        s = samples.source[n]
+        for t in range(scaled.size):
+            scaled[t] = flux[s] * samples.size[n] * field[s, t]
+        size = _add_runs(levels, samples, n, scaled, runs, size)
+    return size
+
+
+@inner()
+def _add_outer(runs, size, weight, line, begin, matrix):
+    """Add weight times the outer product of the runs of levels that do not vary with a line."""
+    for r in range(size):
+        if runs.sample[r] < 0:
+            for k in range(runs.first[r], runs.first[r + 1]):
+                share = weight * runs.values[k]
+                _add_line(share, line, matrix[runs.begin[r] + k - runs.first[r], begin:])
+
+
+@entry()
+def psf_information(levels, field, samples, pixels, templates):
+    """The information about all coefficients, beside the templates and the background's terms.
+
+    `pixels` are the flux of every source, and of every pixel the weight and the background's terms;
+    `templates` has shape (3, samples). Returns the matrix of the coefficients, shape (c, c), of
+    which the sum with its transpose is the information; the couplings with the templates, shape (3
+    sources, c); and with the background's terms, shape (c, terms).
+    """
+    flux, weight, background = pixels
+    last, wide = levels.side.size - 1, _wide(levels)
+    total = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
+    matrix, others = np.zeros((total, total)), np.zeros((total, background.shape[1]))
+    coupling = np.zeros((TEMPLATES * flux.size, total))
+    runs, scaled = _room(levels, samples, weight.size), np.empty(field.shape[1])
+    begin = levels.start[wide] if wide <= last else total
+    lines, filled = np.zeros((LINES, total - begin)), 0
     for i in range(weight.size):
-        w, size = weight[i], 0
+        w = weight[i]
         if w == 0.0:
             continue
-        for n in range(samples.first[i], samples.first[i + 1]):
-            s = samples.source[n]
-            for t in range(scaled.size):
-                scaled[t] = flux[s] * samples.size[n] * field[s, t]
-            size = _add_runs(levels, samples, n, scaled, runs, size)
+        size = _runs_of((levels, field), samples, flux, i, runs, scaled)
         _add_square(runs, size, w, matrix)
-        for m in range(terms):
-            columns[m] = w * background[i, m]
-        columns[terms] = w * residual[i]
-        _add_columns(runs, size, columns, others)
+        _add_columns(runs, size, w * background[i], others)
         for n in range(samples.first[i], samples.first[i + 1]):
-            at = TEMPLATES * samples.source[n]
             for m in range(TEMPLATES):
-                _add_row(runs, size, w * templates[m, n], coupling[at + m])
+                target = coupling[TEMPLATES * samples.source[n] + m]
+                _add_row(runs, size, w * templates[m, n], target)
+        if wide <= last and samples.first[i + 1] > samples.first[i]:
+            line = lines[filled]
+            line[:] = 0.0
+            _add_wings(levels, samples, flux, i, line)
+            _add_outer(runs, size, w, line, begin, matrix)
+            for m in range(background.shape[1]):
+                _add_line(w * background[i, m], line, others[begin:, m])
+            for n in range(samples.first[i], samples.first[i + 1]):
+                for m in range(TEMPLATES):
+                    target = coupling[TEMPLATES * samples.source[n] + m]
+                    _add_line(w * templates[m, n], line, target[begin:])
+            line *= math.sqrt(w)
+            filled += 1
+            if filled == LINES:
+                matrix[begin:, begin:] += 0.5 * np.dot(lines.T, lines)
+                filled = 0
+    matrix[begin:, begin:] += 0.5 * np.dot(lines[:filled].T, lines[:filled])
+    if levels.high[-1 if wide > last else -2] > 1:
+        _add_variation(levels, field, samples, flux, weight, matrix)
     return matrix, coupling, others
+
+
+@entry()
+def psf_slope(levels, field, samples, flux, score):
+    """The log-likelihood's slope by all coefficients, shape (c,), given that by every pixel."""
+    last, wide = levels.side.size - 1, _wide(levels)
+    total = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
+    out, runs = np.zeros(total), _room(levels, samples, score.size)
+    scaled, begin = np.empty(field.shape[1]), levels.start[wide] if wide <= last else total
+    line = np.empty(total - begin)
+    for i in range(score.size):
+        size = _runs_of((levels, field), samples, flux, i, runs, scaled)
+        _add_row(runs, size, score[i], out)
+        if wide <= last and samples.first[i + 1] > samples.first[i]:
+            line[:] = 0.0
+            _add_wings(levels, samples, flux, i, line)
+            _add_line(score[i], line, out[begin:])
+    return out

@@ -1,0 +1,110 @@
+"""What the errors of a measured PSF add to those of the parameters.
+
+With the PSF fixed at its estimate the parameters theta have a posterior of information I. Had the
+PSF been another one, drawn from its own posterior, theta would have come out elsewhere, by I^-1
+times the gradient that the other PSF gives at the old maximum. These displacements have the
+covariance
+
+    W = I^-1 G I^-1,
+
+G that of the gradients. With the PSF integrated out the posterior of theta is the one with the PSF
+fixed, convolved with a normal distribution of covariance W: to every draw from the one a draw of
+the other is added. For a PSF that was measured on the same frame the information that remains, the
+inverse of I^-1 + W, is Schur's complement of the joint information of parameters and PSF
+(Woodbury's identity).
+
+W hardly depends on how much positions or light scatter about the model, unlike the information that
+is lost: the scatter widens what every source says, the PSF moves all of them together. Parameters
+that are such scales are left as they are.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy import linalg
+
+from bayesfred._typing import Floats
+from bayesfred.errors import InputError
+from bayesfred.io.serialize import serializable
+from bayesfred.model.parameters import SCALES
+
+STREAM = 0x507F  # of random numbers, beside those of a run's steps
+
+
+@serializable("psf_errors")
+@dataclass(frozen=True, eq=False)
+class PsfErrors:
+    """The covariance that the errors of a PSF add to that of the parameters.
+
+    Attributes
+    ----------
+    names : tuple of str, length d
+        Parameters.
+    covariance : ndarray, shape (d, d)
+        W.
+    absorbed : float
+        How many numbers of the PSF the same frame's counts determined: they are fitted, too.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ.
+
+    Examples
+    --------
+    >>> errors = PsfErrors(("f_x",), np.array([[4.0]]))
+    >>> bool(abs(errors.displacements(10_000, 1).std() - 2.0) < 0.1)
+    True
+    """
+
+    names: tuple[str, ...]
+    covariance: Floats
+    absorbed: float = 0.0
+
+    def __post_init__(self) -> None:
+        d = len(self.names)
+        if self.covariance.shape != (d, d):
+            raise InputError(f"psf_errors: got shape {self.covariance.shape}, expected ({d}, {d})")
+
+    @classmethod
+    def of(
+        cls,
+        names: tuple[str, ...],
+        information: Floats,
+        gradients: Floats,
+        absorbed: float = 0.0,
+    ) -> Self:
+        """The errors that gradients of the log-posterior, one for each draw of a PSF, stand for.
+
+        Parameters
+        ----------
+        names : tuple of str, length d
+        information : ndarray, shape (d, d)
+            With the PSF fixed, I.
+        gradients : ndarray, shape (draws, d)
+        absorbed : float
+
+        Returns
+        -------
+        PsfErrors
+        """
+        moved = np.flatnonzero([name not in SCALES for name in names])
+        block = information[np.ix_(moved, moved)]
+        scale = 1.0 / np.sqrt(np.diag(block))
+        factor = linalg.cho_factor(block * np.outer(scale, scale))
+        every = np.zeros((len(gradients), len(names)))
+        every[:, moved] = scale * linalg.cho_solve(factor, (gradients[:, moved] * scale).T).T
+        return cls(names, np.atleast_2d(np.cov(every.T)), absorbed)
+
+    def displacements(self, n: int, seed: int) -> Floats:
+        """Draws of what another PSF would add to the parameters, shape (n, d).
+
+        The same number and seed give the same draws.
+        """
+        scale = np.sqrt(np.diag(self.covariance))
+        scale[scale == 0.0] = 1.0
+        variances, axes = linalg.eigh(self.covariance / np.outer(scale, scale))
+        half = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
+        random = np.random.default_rng([STREAM, seed])
+        return np.asarray(random.standard_normal((n, len(half))) @ half.T)
