@@ -62,6 +62,8 @@ from bayesfred.model.kernels.expansion import Pixels, expand
 from bayesfred.model.kernels.noise_dispatch import exact_weight, given
 from bayesfred.model.kernels.patches import Patch, fill_excess, new_patch, weigh_patch
 
+LONGEST = 8.0  # Newton steps in one
+
 
 class _Cluster(NamedTuple):
     """One cluster's sources, whose fluxes and shifts are looked for."""
@@ -166,29 +168,59 @@ def _factor(cluster, h, lower):
 
 
 @inner(error_model="numpy")
-def _take_step(cluster, step):
-    """Move by a fraction of a Newton step; returns the step's largest relative change."""
+def _relative(cluster, step, i):
+    """The largest relative change that a step makes in the flux and shift of source i."""
+    size, flux = cluster.touching.stamps.shape[0], cluster.fluxes[cluster.group.members[i]]
+    largest = abs(step[i * size]) / flux
+    for k in range(i * size + 1, (i + 1) * size):
+        largest = max(largest, abs(step[k]) / cluster.layout.sigma)
+    return largest
+
+
+@inner(error_model="numpy")
+def _take_step(cluster, step, shares, together):
+    """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`.
+
+    Returns the largest relative change of the whole step.
+    """
     fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
-    fluxes, size, largest = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0
-    for i in range(step.size):
-        unit = fluxes[members[i // size]] if i % size == 0 else cluster.layout.sigma
-        largest = max(largest, abs(step[i]) / unit)
-    step *= 1.0 if largest < 0.5 else 1.0 / (1.0 + largest)
+    fluxes, size, most = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0
     for i in range(members.size):
-        s = members[i]
+        largest = _relative(cluster, step, i)
+        most = max(most, largest)
+        if shares[i] * largest >= 0.5:
+            shares[i] = min(shares[i], 1.0 / (1.0 + largest))
+    if together:
+        shares[:] = shares.min()
+    for i in range(members.size):
+        s, own = members[i], shares[i] * step[i * size : (i + 1) * size]
         if size > 1:
             add_template(fp, s, stamps[0], -fluxes[s], cluster.canvas)
-            fluxes[s] += step[i * size]
-            by_x, by_y = step[i * size + 1], step[i * size + 2]
-            cluster.shifts[s, 0] += by_x
-            cluster.shifts[s, 1] += by_y
-            move(cluster.layout.optics, cluster.layout.geometry, s, by_x, by_y)
+            fluxes[s] += own[0]
+            cluster.shifts[s, 0] += own[1]
+            cluster.shifts[s, 1] += own[2]
+            move(cluster.layout.optics, cluster.layout.geometry, s, own[1], own[2])
             _make_templates(cluster, s, fluxes[s])
             add_template(fp, s, stamps[0], fluxes[s], cluster.canvas)
         else:
-            fluxes[s] += step[i]
-            add_template(fp, s, stamps[0], step[i], cluster.canvas)
-    return largest
+            fluxes[s] += own[0]
+            add_template(fp, s, stamps[0], own[0], cluster.canvas)
+    return most
+
+
+@inner(error_model="numpy")
+def _secant(gradient, step, distances, shares, most):
+    """The shares of the next step, given the last one and the gradient where it led.
+
+    Where the weights are not the second derivatives a step goes too far, or not far enough. Two of
+    them tell which share of it ends where the gradient along it vanishes, for every source.
+    """
+    size = step.size // shares.size
+    for i in range(shares.size):
+        if distances[i] > 0.0:
+            own = slice(i * size, (i + 1) * size)
+            left = np.dot(gradient[own], step[own]) / distances[i]
+            shares[i] = min(most, shares[i] / max(1.0 - left, 0.1))
 
 
 @inner(error_model="numpy")
@@ -196,8 +228,11 @@ def _maximize(frame, parameters, cluster, h):
     """Newton's iteration for a cluster; leaves Cholesky's factor of H in h. False if it fails."""
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
     size, noise = touching.stamps.shape[0], given(frame.noise, parameters)
-    step, lower = np.empty(group.lead.size), h.copy() if size > 1 else h
+    exact = exact_weight(noise)
+    step, lower = np.zeros(group.lead.size), h.copy() if size > 1 else h
     distance, rate, converged = 0.0, 1.0, False
+    shares, distances = np.ones(group.members.size), np.zeros(group.members.size)
+    gradient = np.empty(step.size)
     for _ in range(100):
         weigh_patch(frame, noise, parameters.background, patch, None)
         fresh = converged or rate > 0.01  # otherwise the last matrix serves
@@ -206,17 +241,24 @@ def _maximize(frame, parameters, cluster, h):
             add_prior(h, group, cluster.prior, cluster.fluxes, cluster.shifts, SHARE)
         if converged:
             return cholesky(h, group)
-        _fill_gradient(cluster, step)
-        gradient = step.copy()
+        _fill_gradient(cluster, gradient)
         if fresh and not _factor(cluster, h, lower):
             return False
+        if not exact:
+            _secant(gradient, step, distances, shares, LONGEST if size == 1 else 1.0)
+        step[:] = gradient
         solve(lower, group, step)
-        largest = _take_step(cluster, step)
         # The square of the distance in standard deviations, and what a step leaves of it: in a
         # Newton step of fluxes alone the square of the largest relative change.
         before, distance = distance, np.dot(gradient, step)
+        for i in range(shares.size):
+            own = slice(i * size, (i + 1) * size)
+            distances[i] = np.dot(gradient[own], step[own])
+        if exact:
+            shares[:] = 1.0
+        largest = _take_step(cluster, step, shares, exact)
         rate = distance / before if before > 0.0 else 1.0
-        if fresh and size == 1 and exact_weight(noise):
+        if fresh and size == 1 and exact:
             rate = largest * largest
         converged = distance * min(rate, 1.0) <= 1e-16
     return False
