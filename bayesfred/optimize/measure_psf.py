@@ -16,7 +16,7 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_psf import fit_psf
 from bayesfred.optimize.newton import maximize
 
-LEAST_ERROR = 1e-3  # where the search for a model error begins
+LARGEST_ERROR = 0.1  # where the search for a model error begins: with more, misfits grow
 
 
 def measure_psf(
@@ -71,14 +71,21 @@ def measure_psf(
     """
     psf = fit_psf(posterior, estimate, oversampling=oversampling, degree=degree)
     bare = posterior.with_psf(psf)
+    known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
     if model_error:
         given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
         bare = replace(
             bare, nuisances=replace(bare.nuisances, model_error=True), prior={**bare.prior, **given}
         )
-    known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
-    known.setdefault("model_error", max(psf.model_error, LEAST_ERROR))
-    top = maximize(bare, np.array([known[name] for name in bare.parameter_names]))
+    known.setdefault("model_error", min(max(psf.model_error, 1e-3), LARGEST_ERROR))
+    start = np.array([known[name] for name in bare.parameter_names])
+    if not np.isfinite(bare.log_prob(start)):
+        raise InputError(
+            "psf: got one that explains some source with no flux at all, expected images that "
+            "resemble each other: reject outliers (reject_outliers), mask what is no source's, or "
+            "let the PSF vary less over the field (degree)"
+        )
+    top = maximize(bare, start)
     measured = _marginalized(bare, psf, top.params, psf.determined)
     return measured, find_map(measured, top.params)
 
