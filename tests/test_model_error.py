@@ -4,6 +4,7 @@ Negative controls are the same noise without it.
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -248,3 +249,36 @@ def test_a_model_error_costs_little_where_there_is_none() -> None:
     found = pulls(0.0, 20, 723)
     assert np.mean(found[True][1] / found[False][1]) < 1.2
     assert np.mean(np.abs(found[True][0]) < 1.0) > 0.6
+
+
+def test_most_likely_fluxes_are_found_with_any_model_error():
+    """Of stars that touch, with another PSF than theirs, some on the edge of a ghost.
+
+    There the weights are far from second derivatives: full Newton steps found no maximum.
+    """
+    model = ForwardModel(
+        Detector((61, 61), pixel="box"), SourceCatalog.grid(5, 9.0, 1e5), GaussianPSF(1.0),
+        PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]),
+    )  # fmt: skip
+    counts = simulate(model, [0.0, 0.0], 100.0, seed=1)
+    counts[:20, :14] += 5e3
+    wrong = replace(model, psf=GaussianPSF(1.7))
+    posterior = Posterior(wrong, counts, nuisances=Nuisances(flux="free", model_error=True))
+    k, prior = posterior.parameter_names.index("model_error"), stats.gamma(2.0, scale=5e4)
+    for error in (0.01, 0.03, 0.1, 0.2, 0.3, 0.6, 1.0):
+        params = posterior.start()
+        params[k] = error
+        assert np.isfinite(posterior.log_prob(params)), error
+        fluxes = posterior.fluxes(params)
+        for s in (0, 12):
+            values = []
+            for factor in (0.99, 1.0, 1.01):
+                given = np.where(np.arange(25) == s, factor * fluxes, fluxes)
+                sources = SourceCatalog(model.sources.x, model.sources.y, given)
+                fixed = Posterior(
+                    replace(wrong, sources=sources), counts,
+                    nuisances=Nuisances(flux="fixed", model_error=True),
+                )  # fmt: skip
+                value = fixed.likelihood.log_likelihood(params[None], np.ones(1, bool))[0]
+                values.append(value + prior.logpdf(given[s]) + np.log(given[s]))
+            assert values[1] > max(values[0], values[2]), (error, s)
