@@ -219,6 +219,26 @@ def test_conventions_of_volume_and_centroid():
         np.testing.assert_allclose(centroids, 0.0, atol=1e-3)
 
 
+def test_the_psf_leaves_pixels_that_tell_the_background():
+    """Within footprints of 5 pixels it ends before; without them 7 widths from its middle."""
+    sources = bf.SourceCatalog.grid(7, 12.0, 1e5)
+    model = bf.ForwardModel(
+        bf.Detector((97, 97), pixel="box"), sources, bf.GaussianPSF(1.3),
+        bf.PolynomialDistortion.polynomial(1),
+    )  # fmt: skip
+    counts = bf.simulate(model, np.zeros(4), 100.0, seed=1)
+    radii = []
+    for footprint in (5.0, None):
+        nuisances = bf.Nuisances(flux="free", offset=True, footprint=footprint)
+        posterior = bf.Posterior(model, counts, nuisances=nuisances)
+        psf = bf.fit_psf(posterior, bf.find_map(posterior))
+        radii.append(0.5 * (psf.coefficients.shape[-1] - 1) / psf.oversampling)
+        assert abs(psf.sigma - math.hypot(1.3, 12**-0.5)) < 0.02
+    # a tenth of a disk's pixels lie beyond 0.95 of its radius; a grid ends at a whole knot
+    np.testing.assert_allclose(radii[0], 0.95 * 5.0, atol=0.5)
+    assert radii[1] > 6.5  # the middle between four stars is 8.5 pixels from them
+
+
 def test_what_a_psf_adds_is_that_of_a_joint_fit():
     """Against Schur's complement, of a posterior that is normal in parameters and PSF."""
     rng = np.random.default_rng(3)
