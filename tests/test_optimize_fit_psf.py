@@ -12,6 +12,7 @@ from bayesfred.model.kernels.psf_samples import SourceSamples
 from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.optimize.fit_psf import solved, starting_state
 from bayesfred.optimize.psf_levels import PsfGrid
+from bayesfred.optimize.psf_samples import PsfSamples
 
 LINEAR = bf.PolynomialDistortion.polynomial(1)
 
@@ -85,6 +86,40 @@ def test_information_and_slope_agree_with_a_dense_design_matrix(degree, wings):
             for h in (step, -step)
         ]  # fmt: skip
         np.testing.assert_allclose(slope, (moved[0] - moved[1]) / (2 * step), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [bf.PolynomialDistortion.full_polynomial(3), bf.PolynomialDistortion.zernike(3)],
+    ids=["general", "zernike"],
+)
+def test_samples_are_those_that_loops_over_pixels_find(distortion):
+    rng = np.random.default_rng(5)
+    sources = bf.SourceCatalog([-8.0, -5.0, 9.1], [3.3, 4.0, -6.7], [1e3, 1e3, 1e3])
+    model = bf.ForwardModel(bf.Detector((31, 33)), sources, bf.GaussianPSF(1.5), distortion)
+    mask = rng.random((31, 33)) < 0.8
+    nuisances = bf.Nuisances(flux="free", offset=True)
+    posterior = bf.Posterior(model, np.full(mask.shape, 9.0), mask=mask, nuisances=nuisances)
+    params = posterior.start()
+    design = model.polynomial.design_matrix(*(np.array([9.0]),) * 4)
+    params[: design.shape[-1]] = 0.02 * rng.normal(size=design.shape[-1]) / np.abs(design).max()
+    names = posterior.parameter_names
+    params[names.index("offset_x")], params[names.index("offset_y")] = 0.3, -0.6
+    shifts, theta = rng.normal(scale=0.2, size=(3, 2)), params[: distortion.n_terms]
+    data, radius, expected = PsfSamples.at(posterior, params, shifts, 5.0), 5.0, []
+    for row, column in np.argwhere(mask):
+        for s, (x, y) in enumerate(zip(sources.x, sources.y, strict=True)):
+            u, v = column - 16.0, row - 15.0
+            f, g = distortion.displacement(theta, u, v, x, y)
+            a, b = u - x + f - 0.3 - shifts[s, 0], v - y + g + 0.6 - shifts[s, 1]
+            if np.hypot(a, b) <= radius:
+                size = abs(distortion.determinant(theta, u, v, x, y))
+                expected.append((row * 33 + column, s, a, b, size))
+    samples = data.samples
+    found = (data.pixel[data.owner], samples.source, samples.a, samples.b, samples.size)
+    assert len(expected) > 150
+    np.testing.assert_allclose(np.stack(found, axis=1), expected, atol=1e-12)
+    assert sorted(data.pixel) == sorted(np.flatnonzero(mask))
 
 
 def test_the_grids_together_are_one_fine_grid():
@@ -200,6 +235,11 @@ def test_errors_of_the_psf_are_those_of_a_joint_fit():
     widening = marginal / np.sqrt(np.diag(conditional))[own]
     # 100 draws know what is added to a variance to 14 %
     np.testing.assert_allclose(marginal, joint, rtol=0.1)
+    # draws have them too: 4,000 know a standard deviation to 1.1 %
+    drawn = bf.laplace(measured, known, seed=1, draws=4000, progress=False)
+    np.testing.assert_allclose(drawn.draws().std(axis=0)[own], marginal, rtol=0.05)
+    fixed = drawn.chain.reshape(4000, -1)[:, own].std(axis=0)
+    np.testing.assert_allclose(fixed, np.sqrt(np.diag(conditional))[own], rtol=0.05)
     assert np.all(widening > 1.02) and widening.max() > 1.2
 
 

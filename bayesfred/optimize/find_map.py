@@ -154,7 +154,7 @@ def approach(
     start : ndarray, shape (d,), optional
         Where to begin; by default what the counts alone say.
     rejecting : bool
-        Leave out outliers, as `reject_outliers` does.
+        Leave out outliers, as `reject_outliers` does, but for what another PSF may leave of stars.
 
     Returns
     -------

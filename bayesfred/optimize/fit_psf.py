@@ -28,7 +28,7 @@ from bayesfred.imaging.psf.sampled import spline_coefficients
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.psf_equations import WIDTH, PsfEquations, PsfState, field_radius
-from bayesfred.optimize.psf_levels import NARROWEST, RADIUS, STRENGTH, WINGS, PsfGrid
+from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
 from bayesfred.optimize.psf_samples import PsfSamples
 
 KNOTS_PER_WIDTH = 6.0  # at the least: a spline follows any PSF so to 1e-4 of its peak
@@ -40,6 +40,9 @@ LARGEST = 0.4  # change of the PSF in one turn, share of its peak
 DARKEST = 0.1  # of its value that a flux may fall to in one turn
 DRAWS = 100
 DARK = 0.1  # of the pixels are beyond the PSF of every source, where that can be
+RADIUS = 7.0  # of the fine grid, widths of the PSF
+NARROWEST = 4.0  # the same, where stars leave no pixels between them
+WINGS = 21.0  # of the grid for wings
 WINGS_SEEN = 5.0  # standard deviations of light beyond the fine grid that call for a wider one
 
 
@@ -197,8 +200,8 @@ def _moved(posterior: Posterior, equations: PsfEquations, share: float) -> PsfSt
     terms = field_terms(s.x, s.y, state.grid.degree, field_radius(posterior))
     largest = float(np.abs(terms @ change.reshape(len(change), -1)).max())
     share = min(share, LARGEST * peak / max(largest, 1e-300))
-    index, own, response = equations.eliminated
-    every = share * (own - response @ step)
+    index, response = equations.information.which, equations.information.response
+    every = share * (equations.own_step - response @ step)
     params = state.params + share * step[size:]
     fluxes, shifts = state.fluxes.copy(), state.shifts.copy()
     names = posterior.parameter_names

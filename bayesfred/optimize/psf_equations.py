@@ -72,14 +72,6 @@ class PsfState:
         return np.concatenate([self.coefficients[: self.grid.fixed], deviations])
 
 
-class Eliminated(NamedTuple):
-    """Fluxes and shifts: which of the templates, and how they follow the other unknowns."""
-
-    which: Ints
-    step: Floats
-    response: Floats
-
-
 class Pixels(NamedTuple):
     """The pixels of a frame at a state: what they say of the model's light."""
 
@@ -162,7 +154,8 @@ class PsfEquations:
     information : PsfInformation
     pull : ndarray, shape (unknowns,)
         The slope of the log-likelihood and the parameters' priors.
-    eliminated : Eliminated
+    own_step : ndarray, shape (eliminated,)
+        Of fluxes and shifts, while the other unknowns stay.
     model_error : float
         Share of the light by which the model is off.
     """
@@ -170,7 +163,7 @@ class PsfEquations:
     state: PsfState
     information: PsfInformation
     pull: Floats
-    eliminated: Eliminated
+    own_step: Floats
     model_error: float
 
     @classmethod
@@ -200,12 +193,9 @@ class PsfEquations:
         own -= _shift_precision(posterior, state) * shifts
         step = information.solve(own[information.which])
         pull = np.concatenate([psf, inner]) - information.outer @ step
-        out = cls(
-            state, information, pull,
-            Eliminated(information.which, step, information.response), pixels.model_error,
-        )  # fmt: skip
+        out = cls(state, information, pull, step, pixels.model_error)
         if known and known.state.strengths is state.strengths:
-            out.__dict__["factor"] = known.factor
+            out.__dict__["factor"] = known.factor  # of the same matrix
         return out
 
     @cached_property

@@ -27,10 +27,7 @@ from bayesfred._typing import Floats
 from bayesfred.imaging.psf.measured import field_powers
 from bayesfred.model.kernels.psf_normal import Levels
 
-RADIUS = 7.0  # of the fine grid, widths of the PSF
-FIELD_RADIUS = 5.0  # of the grid for the variation over the field
-WINGS = 21.0  # of the grid for wings
-NARROWEST = 4.0  # of the fine grid where stars leave no pixels between them
+FIELD_RADIUS = 5.0  # of the grid for the variation over the field, widths of the PSF
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
 STRENGTH = 100.0  # to begin with
 LIMITS = (1e-3, 1e9)  # of a strength

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
@@ -95,7 +96,10 @@ class Chain:
         """
         kept = self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
         errors = getattr(self.density, "psf_errors", None)
-        return kept if errors is None else kept + errors.displacements(len(kept), self.seed)
+        if errors is None:
+            return kept
+        moved = kept + errors.displacements(len(kept), self.seed)
+        return np.asarray(np.clip(moved, *self.density.support))
 
     def summary(self) -> Table:
         """What the draws say of every parameter, a row each, see `summary.summary`."""
