@@ -9,62 +9,18 @@ import numpy as np
 
 from bayesfred import settings
 from bayesfred._typing import Flags, Floats
-from bayesfred.errors import InputError, printable
+from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFFile, PSFToMeasure, has_pixel
-from bayesfred.io.catalogues import read_catalogue
-from bayesfred.io.frames import FrameRecord, read_frame, require_memory
+from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
 from bayesfred.model import priors
 from bayesfred.model.noise import Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.peaks import typical_flux
-
-# Share of the frame's half-width by which images may stand away from their sources: three standard
-# deviations of a term's default prior. Sources whose light is farther from the frame than that are
-# left out.
-STRAY = 0.3
-
-
-def catalogue(
-    run: settings.RunSettings,
-    run_file: Path,
-    shape: tuple[int, int],
-    psf: PSF,
-    frame: FrameRecord | None = None,
-) -> tuple[SourceCatalog, str]:
-    """The catalogue's sources whose light can reach the frame, and a line that counts them.
-
-    A source is at the edge if the frame's border is within three widths of the PSF, or between it
-    and the frame; and outside if no light reaches the frame from an image that stands `STRAY`
-    nearer. If all are outside, all are kept: the posterior says so. Where fluxes are free and the
-    catalogue has none, all begin at the mean flux of the frame's brightest peaks.
-    """
-    c, path = run.catalogue, resolve(run.catalogue.path, run_file, must_exist=True)
-    free = frame is not None and run.nuisances.flux == "free"
-    column = None if free and "flux" not in c.model_fields_set else c.flux
-    record = read_catalogue(
-        path, x=c.x, y=c.y, flux=column, magnitude=c.magnitude, zero_point=c.zero_point
-    )
-    half = 0.5 * run.detector.binning * np.array(shape)[::-1, None]
-    beyond = np.abs([record.x, record.y]) - half  # pixels, negative inside
-    outside = (beyond > psf.support_radius(run.model.tolerance) + STRAY * half).any(axis=0)
-    kept = ~outside if not outside.all() else outside
-    at_edge = kept & (beyond > -3.0 * psf.sigma).any(axis=0)
-    numbers = (
-        f"{len(record.x)} sources, {at_edge.sum()} at the frame's edge, {(~kept).sum()} "
-        "outside removed"
-    )
-    flux = record.flux
-    if frame is not None and np.isnan(flux).all():
-        width = math.hypot(psf.sigma / run.detector.binning, 12.0**-0.5)
-        inside = int((beyond < 0.0).all(axis=0).sum())
-        flux = np.full_like(flux, typical_flux(frame.counts, frame.valid, width, max(inside, 1)))
-        numbers += f"; without fluxes, which are free and begin at {flux[0]:.3g} counts"
-    sources = SourceCatalog(record.x[kept], record.y[kept], flux[kept])
-    return sources, f"{printable(path.name)}: {numbers}"
+from bayesfred.simulation_sections import SimulationSettings
+from bayesfred.sources import find_sources
 
 
 def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
@@ -141,7 +97,7 @@ def posterior_given(
     )
 
 
-def simulation(run: settings.RunSettings, run_file: Path) -> settings.SimulationSettings:
+def simulation(run: settings.RunSettings, run_file: Path) -> SimulationSettings:
     """The section that describes a frame to simulate; an InputError where there is none."""
     if run.simulation is None:
         raise InputError(
@@ -159,7 +115,7 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
     if s.grid:
         sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)
     else:
-        sources, _ = catalogue(run, run_file, s.shape, psf)
+        sources = find_sources(run, run_file, s.shape, psf)[0]
     model = forward_model(run, s.shape, sources, psf)
     unknown = sorted(set(s.theta) - set(model.distortion.names))
     if unknown:

@@ -42,6 +42,7 @@ from bayesfred.sampling.progress import searching
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import sample
 from bayesfred.sections import toml
+from bayesfred.sources import find_sources
 
 __all__ = [
     "Job",
@@ -114,10 +115,11 @@ def read_frame(
     """
     notes: list[str] = []
 
-    def note(line: str) -> None:
-        notes.append(line)
-        if say:
-            say(line)
+    def note(*lines: str) -> None:
+        notes.extend(lines)
+        for line in lines:
+            if say:
+                say(line)
 
     f = run.frame
     path = paths.resolve(f.path, run_file, must_exist=True)
@@ -130,8 +132,8 @@ def read_frame(
         note(line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = build.reference_psf(run, run_file)
-    sources, census = build.catalogue(run, run_file, shape, psf, frame)
-    note(census)
+    sources, lines = find_sources(run, run_file, shape, psf, frame)
+    note(*lines)
     with naming(run_file):
         model = build.forward_model(run, shape, sources, psf)
         posterior = build.posterior_given(run, model, frame.counts, frame.valid, noise)
@@ -139,8 +141,7 @@ def read_frame(
         if posterior.nuisances.footprint is not None:
             with searching() if say else nullcontext():
                 posterior, estimate, lines = _follow(posterior, rough=rough)
-            for line in lines:
-                note(line)
+            note(*lines)
         if f.reject_outliers:
             with searching() if say else nullcontext():
                 start = None if estimate is None else estimate.params
@@ -152,8 +153,7 @@ def read_frame(
             with searching() if say else nullcontext():
                 choice = choose_terms(posterior)
             posterior, estimate = choice.posterior, choice.estimate
-            for line in choice.lines():
-                note(line)
+            note(*choice.lines())
         if has_pixel(posterior.model.psf) or rough:
             with searching("measuring the PSF") if say else nullcontext():
                 posterior, estimate = _with_measured_psf(posterior, estimate, psf, run)

@@ -32,11 +32,15 @@ from bayesfred.model.parameters import Nuisances
 
 __all__ = [
     "TOO_DEEP",
+    "Count",
     "DistortionSettings",
     "Float",
     "Name",
+    "NotNegative",
     "ObjectSettings",
+    "Positive",
     "Section",
+    "Seed",
     "described",
     "mistake",
     "model_of",
@@ -47,6 +51,10 @@ __all__ = [
 LARGEST = 1e15
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Float = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Count = Annotated[int, Field(ge=1, le=10**15)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Integer = Annotated[int, Field(ge=-(10**15), le=10**15)]
 
 _Power = Annotated[int, Field(ge=0, le=10)]

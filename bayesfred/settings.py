@@ -13,29 +13,31 @@ import json
 import tomllib
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
+from bayesfred.io.tangent_plane import Parity
 from bayesfred.sections import (
-    LARGEST,
     TOO_DEEP,
+    Count,
     DistortionSettings,
     Float,
     Name,
+    Positive,
     Section,
+    Seed,
     described,
     mistake,
 )
+from bayesfred.simulation_sections import SimulationSettings, StudySettings
 
 __all__ = ["PriorSettings", "RunSettings", "read_settings"]
 
-_Positive = Annotated[float, Field(gt=0, le=LARGEST)]
-_NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
-_Count = Annotated[int, Field(ge=1, le=10**15)]
-_Seed = Annotated[int, Field(ge=0, lt=2**63)]
+_Degrees = Annotated[float, Field(ge=-360, le=360)]
+_Declination = Annotated[float, Field(ge=-90, le=90)]
 
 # Sections with the fields of a class: `ObjectSettings`.
 _Detector = Annotated[Any, PlainValidator(partial(described, "detector"))]
@@ -65,7 +67,7 @@ class FrameSettings(Section):
     """
 
     path: Name
-    gain: _Positive | None = None
+    gain: Positive | None = None
     pedestal: Float | None = None
     saturation: Float | None = None
     name: Name | None = None
@@ -73,7 +75,7 @@ class FrameSettings(Section):
 
 
 class CatalogueSettings(Section):
-    """`[catalogue]`: the known sources, as `io.catalogues.read_catalogue` takes them.
+    """`[catalogue]`: the known sources, by their positions on the object plane or on the sky.
 
     Attributes
     ----------
@@ -81,6 +83,14 @@ class CatalogueSettings(Section):
         The catalogue's file.
     x, y : str
         Columns of the positions, pixel from the middle of the frame.
+    ra, dec : str, optional
+        Columns of right ascension and declination (ICRS), in place of x and y: in the unit of the
+        column, degrees without one, or texts such as 12:34:56.7.
+    pm_ra, pm_dec : str, optional
+        Columns of the proper motions, milliarcsecond a year; along right ascension with the cosine
+        of the declination.
+    epoch : float, optional, Julian year
+        Of ra and dec where there are proper motions, by default 2000.
     flux : str
         Column of the fluxes, counts; not needed where [nuisances] has them free.
     magnitude : str, optional
@@ -92,16 +102,64 @@ class CatalogueSettings(Section):
     path: Name
     x: Name = "x"
     y: Name = "y"
+    ra: Name | None = None
+    dec: Name | None = None
+    pm_ra: Name | None = None
+    pm_dec: Name | None = None
+    epoch: Annotated[float, Field(ge=1000, le=3000)] | None = None
     flux: Name = "flux"
     magnitude: Name | None = None
     zero_point: Float | None = None
 
     @model_validator(mode="after")
     def _both_or_neither(self) -> CatalogueSettings:
-        if (self.magnitude is None) != (self.zero_point is None):
-            given = "magnitude" if self.zero_point is None else "zero_point"
-            raise ValueError(f"got {given} alone, expected magnitude and zero_point together")
+        for pair in (("magnitude", "zero_point"), ("ra", "dec"), ("pm_ra", "pm_dec")):
+            _together(self, *pair)
+        if self.ra is not None and (self.x, self.y) != ("x", "y"):
+            raise ValueError("got x or y, expected them without ra and dec only")
+        if self.ra is None and (self.pm_ra or self.epoch):
+            raise ValueError("got pm_ra or epoch, expected them with ra and dec only")
         return self
+
+
+class SkySettings(Section):
+    """`[sky]`: where the frame points, for a catalogue with ra and dec.
+
+    The pose is searched for within 1 degree of the pointing and 5 % of the scale. Without them the
+    coordinate system in the frame's header is used in their place.
+
+    Attributes
+    ----------
+    pointing : (float, float), optional, degree
+        Right ascension and declination (ICRS) of the middle of the frame.
+    pixel_scale : float, optional, arcsecond per recorded pixel
+    position_angle : float, optional, degree
+        Angle from the north through the east to the direction in which rows are counted; by default
+        any.
+    parity : {'sky', 'mirrored'}, optional
+        With rows counted upwards and north up, whether east is on the left, as on the sky, or on
+        the right; by default either.
+    date : str, optional
+        When the frame was taken, ISO 8601, for proper motions; by default the header's DATE-OBS.
+    """
+
+    pointing: tuple[_Degrees, _Declination] | None = None
+    pixel_scale: Positive | None = None
+    position_angle: _Degrees | None = None
+    parity: Parity | None = None
+    date: Name | None = None
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> SkySettings:
+        _together(self, "pointing", "pixel_scale")
+        return self
+
+
+def _together(section: Section, one: str, other: str) -> None:
+    """Refuse one of two keys alone."""
+    given = [key for key in (one, other) if getattr(section, key) is not None]
+    if len(given) == 1:
+        raise ValueError(f"got {given[0]} alone, expected {one} and {other} together")
 
 
 class ModelSettings(Section):
@@ -157,11 +215,11 @@ class SamplingSettings(Section):
         Total number of steps in place of that rule.
     """
 
-    seed: _Seed = 1
+    seed: Seed = 1
     ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
     walkers: Annotated[int, Field(ge=4, le=10_000, multiple_of=2)] = 32
-    target_ess: _Count = 1000
-    steps: _Count | None = None
+    target_ess: Count = 1000
+    steps: Count | None = None
 
 
 class OutputSettings(Section):
@@ -176,90 +234,6 @@ class OutputSettings(Section):
     path: Annotated[str, Field(pattern=r"\.h5$")] | None = None
 
 
-class GridSettings(Section):
-    """`[simulation.grid]`: a square grid of sources, written as the catalogue.
-
-    Attributes
-    ----------
-    side : int
-        Sources a side.
-    spacing : float, pixel
-        Distance between neighbours.
-    flux : float, counts
-        Flux of each source.
-    """
-
-    side: Annotated[int, Field(ge=1, le=1000)]
-    spacing: _Positive
-    flux: _Positive
-
-
-class SimulationSettings(Section):
-    """`[simulation]`: the truth of which `bayesfred simulate` makes a frame.
-
-    Attributes
-    ----------
-    shape : (int, int), pixel
-        Rows and columns (ny, nx) of the frame.
-    theta : dict of float
-        Distortion coefficients by parameter name; terms that are not named are zero.
-    background : float, counts per pixel
-        Expected background.
-    seed : int
-        Seed of the noise.
-    grid : GridSettings, optional
-        Sources to write as the catalogue; without it the catalogue is read.
-    """
-
-    shape: tuple[_Count, _Count]
-    theta: dict[str, Float]
-    background: _NotNegative
-    seed: _Seed = 1
-    grid: GridSettings | None = None
-
-
-class StudySettings(Section):
-    """`[study]`: what `bayesfred study` simulates and fits.
-
-    Attributes
-    ----------
-    kind : {'noise', 'sbc'}
-        Fits of the truth of [simulation] at several noise levels, or of truths from the priors.
-    replicates : int
-        Frames of every noise level, or of the calibration.
-    method : {'laplace', 'mcmc'}, optional
-        Maximum and Fisher information, the default of 'noise', or draws, the default of 'sbc'.
-    seed : int
-        Seed of every random number.
-    background : tuple of float, optional, counts per pixel
-        Noise levels; every combination of these and the following is one.
-    flux : tuple of float, optional, counts
-        Mean fluxes of the sources.
-    sources : tuple of int, optional
-        Numbers of sources: the brightest, and of equally bright ones those that lie farthest apart.
-    psf_sigma : tuple of float, optional, pixel
-        Widths of the PSF.
-    exposure : tuple of float, optional
-        Factors of flux and background together.
-    error : float, pixel
-        The rms error of the displacement for which a noise study counts photons.
-    path : str, optional
-        The table of results, .ecsv, inside the folder that the study is started in.
-    """
-
-    kind: Literal["noise", "sbc"] = "noise"
-    replicates: Annotated[int, Field(ge=2, le=10**7)] = 100
-    method: Literal["laplace", "mcmc"] | None = None
-    seed: _Seed = 1
-    background: tuple[_Positive, ...] | None = None
-    flux: tuple[_Positive, ...] | None = None
-    sources: tuple[_Count, ...] | None = None
-    psf_sigma: tuple[_Positive, ...] | None = None
-    exposure: tuple[_Positive, ...] | None = None
-    error: _Positive = 0.01
-    path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None
-
-
 class RunSettings(Section):
     """A whole run file, one attribute a section.
 
@@ -267,7 +241,7 @@ class RunSettings(Section):
     ----------
     frame, catalogue, psf, distortion
         Sections that every run file has.
-    detector, model, noise, nuisances, sampling, output
+    sky, detector, model, noise, nuisances, sampling, output
         Sections with defaults.
     prior : dict of PriorSettings
         Priors by parameter name, in place of the default ones.
@@ -279,6 +253,7 @@ class RunSettings(Section):
 
     frame: FrameSettings
     catalogue: CatalogueSettings
+    sky: SkySettings = SkySettings()
     detector: _Detector = described("detector", {})
     psf: _PSF
     distortion: DistortionSettings

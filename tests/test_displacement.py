@@ -20,7 +20,7 @@ from bayesfred.analysis.field import (
 )
 from bayesfred.analysis.photons import laplace_error, photons_needed, rounded
 from bayesfred.errors import InputError
-from bayesfred.imaging.polynomial import newton
+from bayesfred.imaging.monomials import newton
 from bayesfred.model.parameters import displacing
 from bayesfred.sampling.displacement import MOST_DRAWS, displacement
 

@@ -73,6 +73,7 @@ def test_defaults(tmp_path: Path) -> None:
         "prior": {},
         "sampling": {"seed": 1, "ensembles": 4, "walkers": 32, "target_ess": 1000},
         "output": {},
+        "sky": {},
     }
 
 

@@ -92,7 +92,8 @@ class _Levels:
         psf = self.model.psf
         if isinstance(psf, GaussianPSF):
             psf = replace(psf, sigma=c["psf_sigma"])
-        model = replace(self.model, sources=SourceCatalog(s.x[kept], s.y[kept], flux), psf=psf)
+        sources = replace(s, x=s.x[kept], y=s.y[kept], flux=flux)
+        model = replace(self.model, sources=sources, psf=psf)
         level = c["background"] * c["exposure"]
         frame = model.expected_counts(self.theta, level)
         posterior = Posterior(

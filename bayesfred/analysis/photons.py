@@ -25,7 +25,6 @@ from bayesfred.analysis.field import (
     pixel_unit,
 )
 from bayesfred.errors import InputError
-from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
@@ -130,7 +129,7 @@ def _brighter(posterior: Posterior, params: Floats, fluxes: Floats) -> Posterior
     p, names = posterior, posterior.parameter_names
     scale = params[names.index("flux_scale")] if "flux_scale" in names else 1.0
     s = p.model.sources
-    model = replace(p.model, sources=SourceCatalog(s.x, s.y, fluxes / scale))
+    model = replace(p.model, sources=replace(s, flux=fluxes / scale))
     # free fluxes would be those of the old counts, and the scales are no part of the mean
     flux = "fixed" if p.nuisances.flux == "free" else p.nuisances.flux
     kept = [name not in SCALES for name in names]

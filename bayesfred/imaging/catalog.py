@@ -6,14 +6,17 @@ along columns, y along rows. `forward` turns a catalogue and a distortion into e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, field
+from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.io.serialize import serializable
+from bayesfred.io.sky import icrs, plane_of_wcs
+from bayesfred.io.tangent_plane import TangentPlane
 
 
 @serializable("catalog")
@@ -28,6 +31,8 @@ class SourceCatalog:
     flux : ndarray, shape (n_sources,), photons
         Expected photons of each source over the whole plane, > 0 and at most 2**53: float64 counts
         no further.
+    sky : TangentPlane, optional
+        Where the object plane is on the sky, where that is known.
 
     Raises
     ------
@@ -44,6 +49,7 @@ class SourceCatalog:
     x: Floats
     y: Floats
     flux: Floats
+    sky: TangentPlane | None = field(default=None, metadata={"since": 7})
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "flux"):
@@ -97,6 +103,58 @@ class SourceCatalog:
         axis = (np.arange(side) - (side - 1) / 2.0) * spacing
         y, x = np.meshgrid(axis, axis, indexing="ij")
         return cls(x.ravel(), y.ravel(), np.full(x.size, flux))
+
+    @classmethod
+    def from_sky(cls, coordinates: Any, flux: npt.ArrayLike, wcs: Any, *, binning: int = 1) -> Self:
+        """Place stars on the object plane of a frame.
+
+        Parameters
+        ----------
+        coordinates : astropy.coordinates.SkyCoord, shape (n_sources,)
+        flux : array_like, shape (n_sources,), photons
+        wcs : astropy.wcs.WCS
+            The frame's, with its size (`pixel_shape`). It need not be exact, and its distortion is
+            not used: its value and slope in the middle of the frame are the object plane.
+        binning : int
+            Fine pixels a recorded one, along either axis.
+
+        Returns
+        -------
+        SourceCatalog
+            With positions in fine pixels from the middle of the frame, and `sky`.
+
+        Raises
+        ------
+        InputError
+            If the coordinate system has no size or no celestial axes, or a star is 90 degrees or
+            more from the middle of the frame.
+
+        Examples
+        --------
+        >>> from astropy.coordinates import SkyCoord
+        >>> from astropy.wcs import WCS
+        >>> wcs = WCS(naxis=2)
+        >>> wcs.wcs.ctype, wcs.wcs.crpix = ("RA---TAN", "DEC--TAN"), (50.5, 50.5)
+        >>> wcs.wcs.crval, wcs.wcs.cdelt = (180.0, 0.0), (-0.01, 0.01)
+        >>> wcs.pixel_shape = (100, 100)
+        >>> stars = SourceCatalog.from_sky(SkyCoord([179.8], [0.1], unit="deg"), [1e4], wcs)
+        >>> print(stars.x.round(2), stars.y.round(2))
+        [20.] [10.]
+        """
+        if getattr(wcs, "array_shape", None) is None:
+            raise InputError(
+                "wcs: got a coordinate system without a size, expected the frame's: set "
+                "wcs.pixel_shape to (columns, rows)"
+            )
+        sky = plane_of_wcs(wcs, wcs.array_shape, binning=binning)
+        x, y = sky.to_plane(*icrs(coordinates))
+        if not np.isfinite(x).all():
+            first = int(np.argmin(np.isfinite(x)))
+            raise InputError(
+                f"coordinates: got star {first} more than 90 degrees from the middle of the "
+                "frame, expected stars that it may show: remove the others"
+            )
+        return cls(x, y, np.asarray(flux), sky)
 
     def __len__(self) -> int:
         """Count the sources."""

@@ -1,4 +1,4 @@
-"""Which object point is imaged at a place, for one or many sets of coefficients.
+"""Which object point is imaged at a place, and where, for one or many sets of coefficients.
 
 At a fixed image point (u, v) the displacements are polynomials in the object point alone:
 
@@ -18,17 +18,29 @@ followed from the axis, whose object (0, 0) is imaged at the offset, along a str
 -1 times the unit matrix on the axis, becomes singular: there the map from object to image folds,
 and beyond it no object is imaged that is connected with the axis. The implicit function theorem
 gives the change of the root with the coefficients: A d(x, y) = -(df, dg) + d(offset).
-`PolynomialDistortion.object_position` and `.displacement_jacobian` offer this to users.
+
+Of many points the roots are followed on a grid, and Newton's method begins from what a spline puts
+between its points. At a fixed object point the same equations are polynomials in (u, v): the image
+is the root near (x, y) + offset, with
+
+    D = [[1 + f_u, f_v], [g_u, 1 + g_v]],    D d(u, v) = -(df, dg) + d(offset).
+
+`PolynomialDistortion.object_position`, `.image_position` and `.displacement_jacobian` offer this to
+users.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.interpolate import RectBivariateSpline
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.monomials import Exponents, U, V, newton
+from bayesfred.imaging.monomials import Exponents, U, V, X, Y, newton
 
 STEPS = 8  # from the axis to a point
+MANY = 2**12  # points, from which on the roots of a grid are followed in their place
+GRID = 33  # points along each side of that grid
+BLOCK = 2**13  # points that are solved at once: what fits the caches
 
 Terms = tuple[Floats, Sequence[Exponents]]  # coefficients, shape (n, n_terms), and their monomials
 Reduced = dict[tuple[int, int], Floats]  # c_ij by (i, j)
@@ -49,17 +61,41 @@ def object_positions(f: Terms, g: Terms, u: Floats, v: Floats, offset: Floats) -
     -------
     ndarray, shape (2, n, points), pixel
     """
-    f_mean, g_mean, mean = (c.mean(axis=0, keepdims=True) for c in (f[0], g[0], offset))
-    by_x, by_y = mean[0]
-    x, y = (u - by_x)[None] / STEPS, (v - by_y)[None] / STEPS
-    before = np.broadcast_to(np.array([-1.0, 0.0, 0.0, -1.0])[:, None, None], (4, *x.shape))
-    for k in range(1, STEPS + 1):
-        at = by_x + (u - by_x) * k / STEPS, by_y + (v - by_y) * k / STEPS
-        equations = _Equations((f_mean, f[1]), (g_mean, g[1]), *at, mean)
-        x, y, before = _root(equations, x, y, before)
-        if k < STEPS:
-            x, y = x * (k + 1) / k, y * (k + 1) / k
-    return np.array(_root(_Equations(f, g, u, v, offset), x, y, before)[:2])
+    mean = tuple(c.mean(axis=0, keepdims=True) for c in (f[0], g[0], offset))
+    middle = (mean[0], f[1]), (mean[1], g[1]), mean[2]
+    near = _between(*middle, u, v) if u.size > MANY else None
+    out = np.empty((2, len(f[0]), u.size))
+    for some in _blocks(u.size):
+        at = u[some], v[some]
+        equations = _objects(f, g, *at, offset)
+        if near is None:
+            start = _followed(*middle, *at)
+        else:
+            x, y = near[0][:, some], near[1][:, some]
+            start = x, y, np.array(_objects(*middle[:2], *at, middle[2])(x, y)[2:])
+        out[:, :, some] = _root(equations, *start)[:2]
+    return out
+
+
+def image_positions(f: Terms, g: Terms, x: Floats, y: Floats, offset: Floats) -> Floats:
+    """Where objects are imaged, shape (2, n, points), pixel; NaN where Newton's method fails.
+
+    Parameters
+    ----------
+    f, g : tuple of ndarray, shape (n, n_terms), and sequence of exponents
+    x, y : ndarray, shape (points,), pixel
+    offset : ndarray, shape (n, 2), pixel
+
+    Returns
+    -------
+    ndarray, shape (2, n, points), pixel
+    """
+    out = np.empty((2, len(f[0]), x.size))
+    for some in _blocks(x.size):
+        by_x, by_y = x[some] + offset[:, :1], y[some] + offset[:, 1:]
+        equations = _Equations((f, g), (x[some], y[some]), (-by_x, -by_y), images=True)
+        out[:, :, some] = newton(equations, by_x, by_y)
+    return out
 
 
 def displacement_jacobian(
@@ -80,27 +116,107 @@ def displacement_jacobian(
     ndarray, shape (points, 2, n_coefficients + 2)
         The last two columns are the derivatives with respect to the offset.
     """
-    u, v, x, y = at
-    a_x, a_y, b_x, b_y = _Equations(f, g, u, v, np.zeros((1, 2)))(x[None], y[None])[2:]
-    matrix = np.array([[a_x, a_y], [b_x, b_y]])[:, :, 0].transpose(2, 0, 1)
-    change = np.concatenate([design, np.broadcast_to(-np.eye(2)[:, None], (2, u.size, 2))], axis=2)
-    known = np.isfinite(x + y)
-    out = np.full((u.size, 2, change.shape[2]), np.nan)
+    matrix = slopes(f, g, at, images=False)
+    change = np.concatenate(
+        [design, np.broadcast_to(-np.eye(2)[:, None], (2, len(matrix), 2))], axis=2
+    )
+    known = np.isfinite(matrix).all(axis=(1, 2))
+    out = np.full((len(matrix), 2, change.shape[2]), np.nan)
     out[known] = np.linalg.solve(matrix[known], change.transpose(1, 0, 2)[known])
     return out
 
 
+def slopes(
+    f: Terms, g: Terms, at: tuple[Floats, Floats, Floats, Floats], *, images: bool
+) -> Floats:
+    """The matrix D of images, or A of objects, shape (points, 2, 2).
+
+    Parameters
+    ----------
+    f, g : tuple of ndarray, shape (1, n_terms), and sequence of exponents
+    at : tuple of ndarray, shape (points,), pixel
+        Image points and the objects that are imaged there: u, v, x, y.
+    images : bool
+
+    Returns
+    -------
+    ndarray, shape (points, 2, 2)
+    """
+    u, v, x, y = at
+    none = np.zeros((1, 1))
+    fixed, free = ((x, y), (u, v)) if images else ((u, v), (x, y))
+    found = _Equations((f, g), fixed, (none, none), images=images)(free[0][None], free[1][None])
+    return np.moveaxis(np.array(found[2:]).reshape(2, 2, u.size), 2, 0)
+
+
 class _Equations:
-    """a, b, a_x, a_y, b_x and b_y at fixed image points, as functions of the object points."""
+    """a, b and their derivatives where (u, v) or (x, y) are fixed, as functions of the others.
 
-    def __init__(self, f: Terms, g: Terms, u: Floats, v: Floats, offset: Floats) -> None:
-        self.f, self.g = (_reduced(*terms, u, v) for terms in (f, g))
-        self.u, self.v = u - offset[:, :1], v - offset[:, 1:]
+    They are a = c + s p + f and b = d + s q + g, with s = -1 for objects (p, q) = (x, y) and s = 1
+    for images (p, q) = (u, v); f is a polynomial in p and q.
+    """
 
-    def __call__(self, x: Floats, y: Floats) -> tuple[Floats, ...]:
-        f, f_x, f_y = _evaluated(self.f, x, y)
-        g, g_x, g_y = _evaluated(self.g, x, y)
-        return self.u - x + f, self.v - y + g, f_x - 1.0, f_y, g_x, g_y - 1.0
+    def __init__(
+        self,
+        terms: tuple[Terms, Terms],
+        fixed: tuple[Floats, Floats],
+        constants: tuple[Floats, Floats],
+        *,
+        images: bool,
+    ) -> None:
+        axes = ((X, Y), (U, V)) if images else ((U, V), (X, Y))
+        self.f, self.g = (_reduced(*each, fixed, *axes) for each in terms)
+        self.c, self.d = constants
+        self.sign = 1.0 if images else -1.0
+
+    def __call__(self, p: Floats, q: Floats) -> tuple[Floats, ...]:
+        f, f_p, f_q = _evaluated(self.f, p, q)
+        g, g_p, g_q = _evaluated(self.g, p, q)
+        s = self.sign
+        return self.c + s * p + f, self.d + s * q + g, f_p + s, f_q, g_p, g_q + s
+
+
+def _objects(f: Terms, g: Terms, u: Floats, v: Floats, offset: Floats) -> _Equations:
+    """The equations of the objects that are imaged at (u, v)."""
+    constants = u - offset[:, :1], v - offset[:, 1:]
+    return _Equations((f, g), (u, v), constants, images=False)
+
+
+def _followed(
+    f: Terms, g: Terms, offset: Floats, u: Floats, v: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """The root of one set of coefficients followed from the axis to (u, v), and A there."""
+    by_x, by_y = offset[0]
+    x, y = (u - by_x)[None] / STEPS, (v - by_y)[None] / STEPS
+    before = np.broadcast_to(np.array([-1.0, 0.0, 0.0, -1.0])[:, None, None], (4, *x.shape))
+    for k in range(1, STEPS + 1):
+        at = by_x + (u - by_x) * k / STEPS, by_y + (v - by_y) * k / STEPS
+        x, y, before = _root(_objects(f, g, *at, offset), x, y, before)
+        if k < STEPS:
+            x, y = x * (k + 1) / k, y * (k + 1) / k
+    return x, y, before
+
+
+def _between(
+    f: Terms, g: Terms, offset: Floats, u: Floats, v: Floats
+) -> tuple[Floats, Floats] | None:
+    """Objects by splines between those of a grid, shape (1, points); None if one is lost."""
+    if not np.isfinite(u + v).all():
+        return None
+    along = [np.linspace(p.min(), p.max(), GRID) for p in (v, u)]
+    if min(np.ptp(axis) for axis in along) <= 0.0:
+        return None
+    rows, columns = np.meshgrid(*along, indexing="ij")
+    x, y, _ = _followed(f, g, offset, columns.ravel(), rows.ravel())
+    if not np.isfinite(x + y).all():
+        return None
+    splines = (RectBivariateSpline(*along, p.reshape(GRID, GRID)) for p in (x, y))
+    found_x, found_y = (spline.ev(v, u)[None] for spline in splines)
+    return found_x, found_y
+
+
+def _blocks(size: int) -> Iterator[slice]:
+    return (slice(first, first + BLOCK) for first in range(0, size, BLOCK))
 
 
 def _root(
@@ -111,7 +227,7 @@ def _root(
     It is not where its determinant has changed its sign, or where it has turned by more than a
     right angle: that is a root of another branch.
     """
-    shape = np.broadcast_shapes(x.shape, equations.u.shape)
+    shape = np.broadcast_shapes(x.shape, equations.c.shape)
     x, y = newton(equations, np.broadcast_to(x, shape), np.broadcast_to(y, shape))
     with np.errstate(all="ignore"):  # roots that are NaN
         matrix = np.array(equations(x, y)[2:])
@@ -120,13 +236,21 @@ def _root(
     return np.where(same, x, np.nan), np.where(same, y, np.nan), matrix
 
 
-def _reduced(theta: Floats, terms: Sequence[Exponents], u: Floats, v: Floats) -> Reduced:
-    """The coefficients c_ij, shape (n, points) each."""
+def _reduced(
+    theta: Floats,
+    terms: Sequence[Exponents],
+    fixed: tuple[Floats, Floats],
+    at: tuple[int, int],
+    free: tuple[int, int],
+) -> Reduced:
+    """The coefficients of the powers of the free variables, shape (n, points) each."""
     by_power: dict[tuple[int, int], list[int]] = {}
-    for k, (i, j, _, _) in enumerate(terms):
-        by_power.setdefault((i, j), []).append(k)
+    for k, term in enumerate(terms):
+        by_power.setdefault((term[free[0]], term[free[1]]), []).append(k)
+    p, q = fixed
     return {
-        power: theta[:, some] @ np.array([u ** terms[k][U] * v ** terms[k][V] for k in some])
+        power: theta[:, some]
+        @ np.array([p ** terms[k][at[0]] * q ** terms[k][at[1]] for k in some])
         for power, some in by_power.items()
     }
 

@@ -16,7 +16,12 @@ from numpy.typing import ArrayLike
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.bases import checked_basis
-from bayesfred.imaging.inverse import Terms, displacement_jacobian, object_positions
+from bayesfred.imaging.inverse import (
+    Terms,
+    displacement_jacobian,
+    image_positions,
+    object_positions,
+)
 from bayesfred.imaging.monomials import (
     Exponents,
     U,
@@ -24,7 +29,6 @@ from bayesfred.imaging.monomials import (
     broadcast,
     checked_terms,
     monomials,
-    newton,
     polynomial,
     term_name,
 )
@@ -269,17 +273,22 @@ class Polynomial:
 
         Parameters
         ----------
-        theta : array_like, shape (n_terms,), pixel^(1 - degree)
-            Coefficients.
+        theta : array_like, shape (n_terms,) or (n, n_terms), pixel^(1 - degree)
+            Coefficients of one distortion, or of n.
         x, y : array_like, pixel
             Object points, broadcast against each other.
-        offset : array_like, shape (2,), pixel
+        offset : array_like, shape (2,) or (n, 2), pixel
             The pointing: `offset_x` and `offset_y` of a posterior.
 
         Returns
         -------
-        u, v : ndarray, the broadcast shape, pixel
+        u, v : ndarray, the broadcast shape, after n if there are n, pixel
             NaN where Newton's method does not converge.
+
+        Raises
+        ------
+        InputError
+            If `theta` does not have one value a term.
 
         Examples
         --------
@@ -290,21 +299,12 @@ class Polynomial:
         110.0 50.0
         """
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
-        f, g = self._split(theta)
-        by_x, by_y = np.asarray(offset, dtype=float)
-
-        def equations(u: Floats, v: Floats) -> tuple[Floats, ...]:
-            point = (x, y, u, v)
-            return (
-                u - x - by_x + polynomial(*f, point),
-                v - y - by_y + polynomial(*g, point),
-                1.0 + polynomial(*f, point, U),
-                polynomial(*f, point, V),
-                polynomial(*g, point, U),
-                1.0 + polynomial(*g, point, V),
-            )
-
-        return newton(equations, x + by_x, y + by_y)
+        values = self.monomial_coefficients(theta)
+        f, g = self._parts(np.atleast_2d(values))
+        shifts = np.broadcast_to(np.asarray(offset, dtype=float), (len(f[0]), 2))
+        u, v = image_positions(f, g, x.ravel(), y.ravel(), shifts)
+        shape = (*values.shape[:-1], *x.shape)
+        return u.reshape(shape), v.reshape(shape)
 
     def object_position(
         self, theta: ArrayLike, u: ArrayLike, v: ArrayLike, *, offset: ArrayLike = (0.0, 0.0)

@@ -1,5 +1,6 @@
 """Catalogues of known sources on disk: CSV and ECSV tables of positions and fluxes.
 
+Positions are pixels of the object plane, or right ascension and declination.
 What a file gets wrong is said in one line (:class:`bayesfred.errors.InputError`), with its row and
 its column. `atomic.replace` does the writing.
 """
@@ -23,8 +24,15 @@ from bayesfred.io.atomic import replace
 from bayesfred.io.frames import LARGEST_COUNT
 from bayesfred.io.paths import may_write
 from bayesfred.io.reading import readable, require_file
+from bayesfred.io.sky import degrees, moved
 
-__all__ = ["CatalogueRecord", "read_catalogue", "write_catalogue"]
+__all__ = [
+    "CatalogueRecord",
+    "SkyRecord",
+    "read_catalogue",
+    "read_sky_catalogue",
+    "write_catalogue",
+]
 
 _FORMATS = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv"}
 
@@ -43,6 +51,23 @@ class CatalogueRecord:
 
     x: Floats
     y: Floats
+    flux: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SkyRecord:
+    """Directions and fluxes of known stars.
+
+    Attributes
+    ----------
+    ra, dec : ndarray, shape (n,), degree
+        ICRS.
+    flux : ndarray, shape (n,), counts
+        Nan where the file has none.
+    """
+
+    ra: Floats
+    dec: Floats
     flux: Floats
 
 
@@ -91,41 +116,84 @@ def read_catalogue(
     array([1000.])
     """
     path = Path(path)
-    table_format = _format(path)
-    if magnitude is not None and (zero_point is None or not math.isfinite(zero_point)):
-        raise InputError(
-            f"{path}: zero_point: got {zero_point}, expected a number with magnitude; give both"
-        )
-    require_file(path)
-    with readable(path, "table"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", AstropyWarning)
-        # A byte order mark would become part of the first column's name.
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        # Astropy's fast reader silently drops what follows an unclosed quotation mark.
-        table = Table.read(lines, format=table_format, fast_reader=False) if any(lines) else Table()
-    if len(table) == 0:
-        raise InputError(
-            f"{path}: got an empty catalogue, expected a heading and at least one source"
-        )
-
-    light = magnitude or flux or ("flux" if "flux" in table.colnames else None)
-    columns = [_column(path, table, column) for column in (x, y, light) if column is not None]
-    if light is None:
-        columns.append(np.full(len(table), np.nan))
-    if magnitude is not None and zero_point is not None:
-        with np.errstate(over="ignore", under="ignore"):
-            columns[2] = 10.0 ** (-0.4 * (columns[2] - zero_point))
-    record = CatalogueRecord(*columns)
-    bad = np.flatnonzero(~((record.flux > 0) & (record.flux <= LARGEST_COUNT)))
-    if bad.size and light is not None:
-        where = f"row {bad[0] + 1}, column {light!r}"
-        got = f"a flux of {record.flux[bad[0]]:.9g}"
-        raise InputError(
-            f"{path}: {where}: got {got}, expected a positive one of at most {LARGEST_COUNT:.0e} "
-            "counts"
-        )
-    _require_distinct(path, record)
+    table = _table(path)
+    record = CatalogueRecord(
+        _column(path, table, x),
+        _column(path, table, y),
+        _fluxes(path, table, flux, magnitude, zero_point),
+    )
+    _require_distinct(path, record.x, record.y)
     return record
+
+
+def read_sky_catalogue(
+    path: PathLike,
+    *,
+    ra: str = "ra",
+    dec: str = "dec",
+    flux: str | None = "flux",
+    magnitude: str | None = None,
+    zero_point: float | None = None,
+    motion: tuple[str, str] | None = None,
+    epoch: float = 2000.0,
+    date: str | None = None,
+) -> SkyRecord:
+    r"""Read a catalogue of stars with their directions.
+
+    Parameters
+    ----------
+    path : path-like
+        A .csv or .ecsv file with one row a star.
+    ra, dec : str
+        Columns of the directions (ICRS): in the unit of the column, or numbers in degrees, or texts
+        such as 12:34:56.7 (hours for `ra`) and -12d34m56s.
+    flux, magnitude, zero_point
+        As for `read_catalogue`.
+    motion : (str, str), optional
+        Columns of the proper motions (milliarcsecond a year): along right ascension, with the
+        cosine of the declination, and along declination.
+    epoch : float, Julian year
+        Of the directions.
+    date : str, optional
+        ISO 8601: when the frame was taken; needed with `motion`.
+
+    Returns
+    -------
+    SkyRecord
+        At the date of the frame, if there are proper motions.
+
+    Raises
+    ------
+    InputError
+        As `read_catalogue`; a declination is beyond a pole; there are proper motions, but no date.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "stars.csv").write_text("ra,dec,flux\n18:36:56.3,38d47m1s,9e4\n")
+    ...     print(read_sky_catalogue(f"{folder}/stars.csv").ra.round(4))
+    [279.2346]
+    """
+    path = Path(path)
+    table = _table(path)
+    fluxes = _fluxes(path, table, flux, magnitude, zero_point)
+    right, up = (_angles(path, table, name, hours=name == ra) for name in (ra, dec))
+    beyond = np.flatnonzero(np.abs(up) > 90.0)
+    if beyond.size:
+        raise InputError(
+            f"{path}: row {beyond[0] + 1}, column {dec!r}: got {up[beyond[0]]:g}, expected a "
+            "declination from -90 to 90 degrees"
+        )
+    if motion is not None:
+        if date is None:
+            raise InputError(
+                f"{path}: got proper motions, expected the date of the frame too: give sky.date"
+            )
+        rates = _column(path, table, motion[0]), _column(path, table, motion[1])
+        right, up = moved(right, up, rates, epoch, date)
+    _require_distinct(path, right, up)
+    return SkyRecord(right, up, fluxes)
 
 
 def write_catalogue(path: PathLike, record: CatalogueRecord, *, overwrite: bool = False) -> None:
@@ -165,14 +233,82 @@ def _format(path: Path) -> str:
     return _FORMATS[suffix]
 
 
-def _column(path: Path, table: Table, name: str) -> Floats:
+def _table(path: Path) -> Table:
+    """The table in a file, with at least one row."""
+    table_format = _format(path)
+    require_file(path)
+    with readable(path, "table"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        # A byte order mark would become part of the first column's name.
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        # Astropy's fast reader silently drops what follows an unclosed quotation mark.
+        table = Table.read(lines, format=table_format, fast_reader=False) if any(lines) else Table()
+    if len(table) == 0:
+        raise InputError(
+            f"{path}: got an empty catalogue, expected a heading and at least one source"
+        )
+    return table
+
+
+def _fluxes(
+    path: Path, table: Table, flux: str | None, magnitude: str | None, zero_point: float | None
+) -> Floats:
+    """The fluxes of a table, which are nan where it has none and needs none."""
+    if magnitude is not None and (zero_point is None or not math.isfinite(zero_point)):
+        raise InputError(
+            f"{path}: zero_point: got {zero_point}, expected a number with magnitude; give both"
+        )
+    light = magnitude or flux or ("flux" if "flux" in table.colnames else None)
+    if light is None:
+        return np.full(len(table), np.nan)
+    fluxes = _column(path, table, light)
+    if magnitude is not None and zero_point is not None:
+        with np.errstate(over="ignore", under="ignore"):
+            fluxes = 10.0 ** (-0.4 * (fluxes - zero_point))
+    bad = np.flatnonzero(~((fluxes > 0) & (fluxes <= LARGEST_COUNT)))
+    if bad.size:
+        where = f"row {bad[0] + 1}, column {light!r}"
+        raise InputError(
+            f"{path}: {where}: got a flux of {fluxes[bad[0]]:.9g}, expected a positive one of at "
+            f"most {LARGEST_COUNT:.0e} counts"
+        )
+    return fluxes
+
+
+def _angles(path: Path, table: Table, name: str, *, hours: bool) -> Floats:
+    """A column of angles in degrees."""
+    column = _present(path, table, name)
+    if column.dtype.kind not in "OSU":
+        return degrees(_column(path, table, name), column.unit, hours=hours)
+    angles = np.empty(len(table))
+    for row, cell in enumerate(column):
+        try:
+            angles[row] = degrees([cell], None, hours=hours)[0]
+        except ValueError:
+            angles[row] = np.nan
+        if not math.isfinite(angles[row]):
+            raise InputError(
+                f"{path}: row {row + 1}, column {name!r}: got {str(cell)!r}, expected degrees, or "
+                "a text such as 12:34:56.7"
+            )
+    return angles
+
+
+def _present(path: Path, table: Table, name: str) -> Any:
+    """A column, or one line that says which there are."""
     if name not in table.colnames:
         present = ", ".join(map(repr, table.colnames))
         raise InputError(
             f"{path}: got no column {name!r}, expected one of: {present}; give its name"
         )
+    return table[name]
+
+
+def _column(path: Path, table: Table, name: str) -> Floats:
+    """A column of finite numbers."""
+    column = _present(path, table, name)
     values = np.empty(len(table))
-    for row, cell in enumerate(table[name]):
+    for row, cell in enumerate(column):
         values[row] = np.nan if np.ma.is_masked(cell) else _number(cell)
         if not math.isfinite(values[row]):
             got = "nothing" if np.ma.is_masked(cell) else repr(str(cell))
@@ -192,9 +328,9 @@ def _number(cell: Any) -> float:
         return np.nan
 
 
-def _require_distinct(path: Path, record: CatalogueRecord) -> None:
+def _require_distinct(path: Path, x: Floats, y: Floats) -> None:
     first: dict[tuple[float, float], int] = {}
-    for row, position in enumerate(zip(record.x.tolist(), record.y.tolist(), strict=True), start=1):
+    for row, position in enumerate(zip(x.tolist(), y.tolist(), strict=True), start=1):
         if first.setdefault(position, row) != row:
             got = f"({position[0]:.9g}, {position[1]:.9g}) again, as in row {first[position]}"
             raise InputError(

@@ -23,6 +23,8 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError, printable
 from bayesfred.io.headers import KEYWORDS
 from bayesfred.io.reading import readable
+from bayesfred.io.sky import header_date, header_plane
+from bayesfred.io.tangent_plane import TangentPlane
 
 __all__ = ["StoredImage", "read_fits"]
 
@@ -43,12 +45,18 @@ class StoredImage(NamedTuple):
         The pixels that each extension flags as bad, by its name.
     unused : tuple of str
         Names of extensions with errors or weights, of which no use is made.
+    sky : TangentPlane or None
+        Where the header places the frame on the sky, in stored pixels.
+    date : str or None
+        When it was taken.
     """
 
     stored: Floats
     header: Mapping[str, Any] = MappingProxyType({})
     flags: Mapping[str, Flags] = MappingProxyType({})
     unused: tuple[str, ...] = ()
+    sky: TangentPlane | None = None
+    date: str | None = None
 
 
 class _Stream(io.BufferedReader):
@@ -104,7 +112,9 @@ def read_fits(
                         pass  # up to the checksum, which astropy does not reach
                     both = (hdus[0].header, hdu.header)
                     header = {key: h[key] for h in both for key in KEYWORDS if key in h}
-                    return StoredImage(image, header, flags, unused)
+                    date = header_date(hdu.header) or header_date(hdus[0].header)
+                    sky = header_plane(hdu.header, hdu.shape)
+                    return StoredImage(image, header, flags, unused, sky, date)
             seen = [f"{label} {' x '.join(map(str, h.shape)) or 'without data'}"
                     for label, h in images]  # fmt: skip
     expected = "a 2-D image" if name is None else f"a 2-D image in extension {name!r}"

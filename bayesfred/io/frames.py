@@ -25,10 +25,11 @@ from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.errors import InputError, printable
 from bayesfred.io.atomic import replace
 from bayesfred.io.fits_images import StoredImage, read_fits
-from bayesfred.io.headers import calibration
+from bayesfred.io.headers import conversion
 from bayesfred.io.paths import may_write
 from bayesfred.io.reading import readable, require_file
 from bayesfred.io.saturation import plateau
+from bayesfred.io.tangent_plane import TangentPlane
 
 __all__ = [
     "LARGEST_COUNT",
@@ -72,6 +73,10 @@ class FrameRecord:
         its header or not.
     read_noise : float or None, e-
         As a FITS header has it.
+    sky : TangentPlane or None
+        Where a FITS header places the frame on the sky, in recorded pixels.
+    date : str or None
+        When a FITS header says that it was taken.
     """
 
     counts: Floats
@@ -79,6 +84,8 @@ class FrameRecord:
     n_masked: int
     description: str
     read_noise: float | None = None
+    sky: TangentPlane | None = None
+    date: str | None = None
 
 
 def read_frame(
@@ -146,7 +153,7 @@ def read_frame(
         raise InputError(f"{path}: saturation: got {saturation}, expected a level in stored units")
     image = read_stored(path, name)
     stored = image.stored
-    known = calibration(path, image.header, gain=gain, pedestal=pedestal, saturation=saturation)
+    known = conversion(path, image.header, gain=gain, pedestal=pedestal, saturation=saturation)
     notes = [*known.notes, *(f"{unused} not used" for unused in image.unused)]
 
     finite = np.isfinite(stored)
@@ -181,7 +188,8 @@ def read_frame(
     n_masked = int(valid.size - valid.sum())
     masked = f"{n_masked} masked ({reasons})" if n_masked else "none masked"
     said = "; ".join([f"{_by(stored.shape)} pixels, {masked}", *notes])
-    return FrameRecord(counts, valid, n_masked, f"{printable(path.name)}: {said}", known.read_noise)
+    said = f"{printable(path.name)}: {said}"
+    return FrameRecord(counts, valid, n_masked, said, known.read_noise, image.sky, image.date)
 
 
 def read_stored(path: PathLike, name: str | None = None) -> StoredImage:

@@ -1,6 +1,6 @@
-"""What a chain file must be before anything is read from it.
+"""What a chain file, or a calibration, must be before anything is read from it.
 
-A chain file ends with its seal, a line with the SHA-256 of everything before it; HDF5 ignores what
+Such a file ends with its seal, a line with the SHA-256 of everything before it; HDF5 ignores what
 follows its own end. So a bit that flipped, a cut or an edit shows before HDF5 sees the file. A file
 made to do harm can be sealed too. So every link, attribute and array is checked next, before any of
 them is read: they must be plain numbers and texts that lie in the file itself, each once and in
@@ -21,8 +21,13 @@ from h5py import h5a, h5d, h5l, h5o, h5t, h5z
 from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
-SCHEMA = 6
-READABLE = (3, 4, 5, 6)  # not all that it may hold; see `sampling/chainfile`
+CALIBRATION = b"bayesfred calibration"
+SCHEMA = 7
+READABLE = {  # schemas by kind; not all that a chain may hold, see `sampling/chainfile`
+    KIND: (3, 4, 5, 6, 7),
+    CALIBRATION: (7,),
+}
+COMMANDS = {KIND: "fit", CALIBRATION: "calibration"}  # which write them
 SEAL = "\nbayesfred sha256 {}\n"
 SEAL_SIZE = len(SEAL.format("0" * 64))
 
@@ -47,12 +52,14 @@ def stated_digest(path: Path) -> str:
 
 
 @contextmanager
-def open_checked(path: Path) -> Iterator[h5py.File]:
-    """A chain file to read from, once it has passed; whatever is wrong with it becomes one line.
+def open_checked(path: Path, kind: bytes = KIND) -> Iterator[h5py.File]:
+    """A file to read from, once it has passed; whatever is wrong with it becomes one line.
 
     Parameters
     ----------
     path : Path
+    kind : bytes
+        What it must be.
 
     Yields
     ------
@@ -61,21 +68,22 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
     Raises
     ------
     InputError
-        If the file is missing, is no chain file, was changed or damaged since it was written, is of
+        If the file is missing, is of another kind, was changed or damaged since it was written, is of
         another schema, or holds anything but plain arrays and attributes; and if what is read from
         it within the `with` block makes no sense.
     """
     if not path.is_file():
         raise InputError(
-            f"{path}: no such file, expected a chain written by `bayesfred fit`: check the path"
+            f"{path}: no such file, expected a {_name(kind)} written by `bayesfred "
+            f"{COMMANDS[kind]}`: check the path"
         )
     try:
         with open(path, "rb") as stream:
-            size = _check_seal(stream)
+            size = _check_seal(stream, kind)
             # the very file whose seal was checked, even if another is renamed over it meanwhile
             with h5py.File(stream, "r") as file:
                 _check_attributes("", file.id)
-                _check_schema(file.attrs.get("kind"), file.attrs.get("schema"))
+                _check_schema(kind, file.attrs.get("kind"), file.attrs.get("schema"))
                 _check_tree(file.id, size)
                 yield file
     except InputError as error:
@@ -91,11 +99,15 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
     ) as error:
         reason = " ".join(str(error).split())[:400]
         raise InputError(
-            f"{path}: damaged ({reason}), expected a whole chain file: {REMEDY}"
+            f"{path}: damaged ({reason}), expected a whole {_name(kind)} file: {REMEDY}"
         ) from None
 
 
-def _check_seal(stream: BinaryIO) -> int:
+def _name(kind: bytes) -> str:
+    return kind.decode().removeprefix("bayesfred ")
+
+
+def _check_seal(stream: BinaryIO, kind: bytes) -> int:
     """Size of the file, whose content is what its seal says; the stream is back at its start."""
     size = os.fstat(stream.fileno()).st_size
     digest, left = hashlib.sha256(), size - SEAL_SIZE
@@ -106,7 +118,8 @@ def _check_seal(stream: BinaryIO) -> int:
     found = stream.read()
     if not found.startswith(SEAL.split("{", maxsplit=1)[0].encode()):
         raise InputError(
-            f"got no seal at the end, expected a whole chain written by `bayesfred fit`: {REMEDY}"
+            f"got no seal at the end, expected a whole {_name(kind)} written by `bayesfred "
+            f"{COMMANDS[kind]}`: {REMEDY}"
         )
     if found != SEAL.format(digest.hexdigest()).encode():
         raise InputError(
@@ -117,16 +130,16 @@ def _check_seal(stream: BinaryIO) -> int:
     return size
 
 
-def _check_schema(kind: Any, schema: Any) -> None:
-    if kind == KIND and schema in READABLE:
+def _check_schema(expected: bytes, kind: Any, schema: Any) -> None:
+    if kind == expected and schema in READABLE[expected]:
         return
-    later = bool(kind == KIND and schema > SCHEMA)
+    later = bool(kind == expected and schema > SCHEMA)
     remedy = "read it with the version that wrote it" if later else "remake it with this version"
     got = (
         f"{kind.decode(errors='replace') if isinstance(kind, bytes) else kind!r} of "
         f"{'newer ' * later}schema {schema}"
     )
-    raise InputError(f"got {got}, expected {KIND.decode()} of schema {SCHEMA}: {remedy}")
+    raise InputError(f"got {got}, expected {expected.decode()} of schema {SCHEMA}: {remedy}")
 
 
 def _check_tree(root: Any, size: int) -> None:

@@ -1,6 +1,6 @@
 """What a FITS header says of its numbers: unit, gain, read noise, pedestal, saturation.
 
-`calibration` holds it against what the caller says. A keyword is honoured, said not to be used, or
+`conversion` holds it against what the caller says. A keyword is honoured, said not to be used, or
 refused in one line; none is dropped without a word. What the caller gives counts more than a header
 but for a unit of electrons, which leaves nothing to convert.
 """
@@ -15,7 +15,7 @@ from typing import Any
 
 from bayesfred.errors import InputError, printable
 
-__all__ = ["KEYWORDS", "Calibration", "calibration", "noise_in", "units"]
+__all__ = ["KEYWORDS", "Conversion", "conversion", "noise_in", "units"]
 
 GAIN = ("EGAIN", "GAIN", "CCDGAIN", "ESO DET OUT1 CONAD")  # e-/adu
 READ_NOISE = ("RDNOISE", "READNOIS", "READNOISE", "ENOISE", "ESO DET OUT1 RON")
@@ -30,7 +30,7 @@ LARGEST_GAIN = 30.0  # e-/adu; a larger GAIN is the setting of a camera, not its
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Conversion:
     """How stored numbers become counts, and what is known of the detector.
 
     Attributes
@@ -52,14 +52,14 @@ class Calibration:
     notes: tuple[str, ...]
 
 
-def calibration(
+def conversion(
     path: Path,
     header: Mapping[str, Any],
     *,
     gain: float | None,
     pedestal: float | None,
     saturation: float | None,
-) -> Calibration:
+) -> Conversion:
     """Hold a header against what the caller says.
 
     Parameters
@@ -73,7 +73,7 @@ def calibration(
 
     Returns
     -------
-    Calibration
+    Conversion
 
     Raises
     ------
@@ -121,7 +121,7 @@ def calibration(
     if read_noise is not None and not 0.0 <= read_noise < math.inf:
         found.notes.append(f"{found.key(READ_NOISE)} = {read_noise} not used: no read noise")
         read_noise = None
-    return Calibration(gain, pedestal, saturation, read_noise, tuple(found.notes))
+    return Conversion(gain, pedestal, saturation, read_noise, tuple(found.notes))
 
 
 def units(header: Mapping[str, Any]) -> str:

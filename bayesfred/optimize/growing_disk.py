@@ -13,7 +13,6 @@ import numpy as np
 from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
-from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
@@ -72,7 +71,7 @@ def _part(posterior: Posterior, sources: Flags, pixels: Flags, width: float) -> 
     """The posterior of some sources in some pixels, the frame blurred to a PSF width."""
     model, s = posterior.model, posterior.model.sources
     blur = np.sqrt(width**2 - model.psf.sigma**2) / model.detector.binning
-    few = SourceCatalog(s.x[sources], s.y[sources], s.flux[sources])
+    few = replace(s, x=s.x[sources], y=s.y[sources], flux=s.flux[sources])
     flux = posterior.nuisances.flux
     return Posterior(
         replace(model, sources=few, psf=GaussianPSF(width) if blur > 0 else model.psf),

@@ -154,7 +154,7 @@ class _Residuals:
 
     def share(self, lost: Flags) -> float:
         """Of the sources in the frame, those that are lost."""
-        return float(lost[self.inside].sum() / max(self.inside.sum(), 1))
+        return float(lost[self.inside].sum() / max(int(self.inside.sum()), 1))
 
     def none_left(self, missing: Flags) -> bool:
         """Whether no source remains in the frame, of which a posterior could be made."""
@@ -250,9 +250,8 @@ def _part(posterior: Posterior, missing: Flags, mask: Flags) -> Posterior:
     """The posterior of these pixels, without the missing sources."""
     model, s = posterior.model, posterior.model.sources
     if missing.any():
-        model = replace(
-            model, sources=SourceCatalog(s.x[~missing], s.y[~missing], s.flux[~missing])
-        )
+        kept = replace(s, x=s.x[~missing], y=s.y[~missing], flux=s.flux[~missing])
+        model = replace(model, sources=kept)
     elif np.array_equal(mask, posterior.mask):
         return posterior
     noise, nuisances = posterior.noise, posterior.nuisances

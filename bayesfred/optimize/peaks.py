@@ -72,11 +72,38 @@ def typical_flux(counts: Floats, mask: Flags, width: float, number: int) -> floa
     float, counts
         At least 1.
     """
+    heights = bright_peaks(counts, mask, width)[1][:number]
+    return max(4.0 * np.pi * width**4 * float(np.mean(heights)), 1.0) if heights.size else 1.0
+
+
+def bright_peaks(counts: Floats, mask: Flags, width: float) -> tuple[Floats, Floats]:
+    """Peaks as wide as the PSF, on any smooth background, of a frame without a model.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (ny, nx), counts
+    mask : ndarray of bool, shape (ny, nx)
+        The pixels to use.
+    width : float, recorded pixel
+        The PSF's, pixels included.
+
+    Returns
+    -------
+    positions : ndarray, shape (n, 2), recorded pixel
+        u and v from the middle of the frame, highest first.
+    heights : ndarray, shape (n,)
+        In the frame filtered with minus the Laplacian of a Gaussian of this width.
+    """
     filled = np.where(mask, counts, np.median(counts[mask]))
     filtered = -ndimage.gaussian_laplace(filled, width)
     peak = filtered == ndimage.maximum_filter(filtered, 2 * int(np.ceil(width)) + 1)
-    heights = np.sort(filtered[peak & mask])[-number:]
-    return max(4.0 * np.pi * width**4 * float(np.mean(heights)), 1.0) if heights.size else 1.0
+    noise = 1.4826 * np.median(np.abs(filtered - np.median(filtered)))
+    row, column = np.nonzero(peak & mask & (filtered > SIGNIFICANCE * noise))
+    order = np.argsort(-filtered[row, column], kind="stable")
+    row, column = row[order], column[order]
+    middle = 0.5 * (np.array(counts.shape) - 1.0)
+    positions = (vertex(filtered, row, column) - middle)[:, ::-1]
+    return np.asarray(positions), np.asarray(filtered[row, column])
 
 
 def vertex(image: Floats, row: Ints, column: Ints) -> Floats:

@@ -226,7 +226,8 @@ class BackgroundNoise(_Gaussian):
             )
 
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
-        return sources + rng.poisson(np.broadcast_to(background, sources.shape))
+        noise = rng.poisson(np.broadcast_to(background, sources.shape))
+        return np.asarray(sources + noise, np.float64)
 
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
         return np.ones_like(mean) / background

@@ -1,0 +1,21 @@
+"""Whole runs from a run file: build the posterior, fit, sample, judge, write the report.
+
+Every command returns a record and prints nothing. What should be known while it works goes to
+`say`, which is told one line at a time. `show.py` prints the records.
+"""
+
+from bayesfred.commands.fitting import demo, fit, report, simulate_frame
+from bayesfred.commands.judging import compare, crosscheck, study, verify
+from bayesfred.proposal import init
+
+__all__ = [
+    "compare",
+    "crosscheck",
+    "demo",
+    "fit",
+    "init",
+    "report",
+    "simulate_frame",
+    "study",
+    "verify",
+]

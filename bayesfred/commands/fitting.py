@@ -1,0 +1,205 @@
+"""Commands that make and fit frames: simulate them, fit them, report."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bayesfred import build, pipeline, settings
+from bayesfred._typing import PathLike
+from bayesfred.analysis.photons import photons_needed
+from bayesfred.errors import InputError
+from bayesfred.imaging.psf import MeasuredPSF
+from bayesfred.io import outputs, paths
+from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
+from bayesfred.io.frames import write_frame
+from bayesfred.pipeline import Say
+from bayesfred.records import Result, Simulated
+from bayesfred.sampling.chainfile import open_chain
+
+DEMO_ERROR = 0.001  # pixel
+DEMO_NOTE = (
+    "The paper's first figure: 9 x 9 sources of 100,000 photons, 50 pixels apart, and a Gaussian "
+    "PSF of 10 pixels. The coefficients are those of its Table 2, read with g in y and the columns "
+    "in the order u2x, v2x, ux, vx, ux2, vx2: one of the readings in which the paper's results are "
+    "possible."
+)
+
+
+def demo(
+    folder: PathLike,
+    *,
+    seed: int = 1,
+    map_only: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
+) -> Result:
+    """Simulate the frame of the example run file, which is the paper's, and fit it.
+
+    Parameters
+    ----------
+    folder : path-like
+        Where demo.h5 goes; created if it does not exist.
+    seed : int
+        Seed of the frame and of the sampler.
+    map_only : bool
+        Do not sample, see `fit`.
+    overwrite : bool
+        Replace an earlier demo.
+    say : callable, optional
+        Told what is known early, a line at a time. Without it no progress is shown either.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be created, or holds a demo already.
+    """
+    output = Path(folder, "demo.h5")
+    outputs.make_folder(output)
+    example = Path(settings.__file__).with_name("example.toml")
+    run = settings.read_settings(example).seeded(seed)
+    posterior, truth = build.simulated(run, example, seed)
+    job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
+    result = pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
+    needed = photons_needed(posterior, result.chain.estimate.params, DEMO_ERROR)
+    return replace(result, photons=needed)
+
+
+def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
+    """Simulate the frame that a run file describes, and write it and its source grid, if any.
+
+    Parameters
+    ----------
+    run_file : path-like
+        Its [simulation] describes the frame.
+    overwrite : bool
+        Replace frame and catalogue.
+
+    Returns
+    -------
+    Simulated
+
+    Raises
+    ------
+    InputError
+        If there is no [simulation], it cannot be simulated, or a file exists.
+    """
+    run_file = Path(run_file)
+    run = settings.read_settings(run_file)
+    simulation = build.simulation(run, run_file)
+    if run.frame.gain is not None or run.frame.pedestal:
+        raise InputError(
+            f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts "
+            "are written: remove them"
+        )
+    posterior, truth = build.simulated(run, run_file, simulation.seed)
+    # written beside the run file, whatever lies in the data folder
+    folder, grid = run_file.parent, simulation.grid is not None
+    frame = paths.within(folder, run.frame.path, f"{run_file}: frame.path")
+    catalogue = paths.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
+    paths.may_write(frame, overwrite=overwrite, beside=(catalogue,) if grid else ())
+    if grid:
+        s = posterior.model.sources
+        record = CatalogueRecord(s.x, s.y, s.flux)
+        write_catalogue(catalogue, record, overwrite=overwrite)
+    write_frame(frame, posterior.counts, overwrite=overwrite)
+    return Simulated(posterior, truth, frame, catalogue if grid else None)
+
+
+def fit(
+    run_file: PathLike,
+    *,
+    map_only: bool = False,
+    resume: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
+) -> Result:
+    """Fit the frame of a run file: MAP, draws, diagnostics, report.
+
+    Parameters
+    ----------
+    run_file : path-like
+        TOML, see `bayesfred fit --help`.
+    map_only : bool
+        Do not sample: draw from the Laplace approximation at the maximum, see `bf.laplace`.
+    resume : bool
+        Resume the run in the output file.
+    overwrite : bool
+        Replace the output file.
+    say : callable, optional
+        Told what is known early, a line at a time. Without it no progress is shown either.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the run file, the frame or the catalogue is unusable, or the output file exists.
+    """
+    run_file = Path(run_file)
+    run = settings.read_settings(run_file)
+    given = run.output.path or Path("chains", f"{run_file.stem}.h5")
+    # inside the folder in which the run is started, whatever a run file from elsewhere says
+    output = paths.within(".", given, f"{run_file}: output.path")
+    frame = paths.resolve(run.frame.path, run_file, must_exist=True)
+    if os.path.exists(output) and output.samefile(frame):
+        raise InputError(
+            f"{run_file}: output.path: got the frame's file, expected another: the chain would "
+            "replace the frame"
+        )
+    posterior, estimate, notes = pipeline.read_frame(run, run_file, say)
+    if run.output.path is None:
+        outputs.make_folder(output)
+    job = pipeline.Job(run, run_file, output, notes)
+    return pipeline.fit_frame(
+        job, posterior, estimate, map_only=map_only, resume=resume, overwrite=overwrite, say=say
+    )
+
+
+def report(
+    chain_file: PathLike,
+    *,
+    target_ess: float | None = None,
+    corner: Sequence[str] = (),
+    out: PathLike | None = None,
+    overwrite: bool = False,
+) -> Result:
+    """Judge a chain file again, and write its page and picture.
+
+    Parameters
+    ----------
+    chain_file : path-like
+    target_ess : float, optional
+        Effective draws to ask of every parameter; by default the number that the run was made for.
+    corner : sequence of str, optional
+        Parameters to show in pairs; by default all, or of more than twelve those of the most
+        correlated pairs.
+    out : path-like, optional
+        The page, .html; by default beside the chain. The other files go beside the page.
+    overwrite : bool
+        Replace page, picture and table.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the chain is missing, damaged, or named as its page or picture would be; if a page,
+        picture or table exists, or `corner` names what is no parameter.
+    """
+    path, chain = Path(chain_file), open_chain(chain_file)
+    default, *others = outputs.beside(path if out is None else Path(out))
+    page = default if out is None else Path(out)
+    if isinstance(chain.posterior().model.psf, MeasuredPSF):
+        others.append(outputs.psf_beside(page))
+    outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
+    ess = target_ess or chain.target_ess
+    return pipeline.write_results(chain, path, page, target_ess=ess, corner=corner)
