@@ -11,7 +11,8 @@ from .analysis.photon_transfer import PhotonTransfer, photon_transfer
 from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.prior_predictive import PriorPredictive, prior_predictive
 from .analysis.sbc import SBCResult, simulation_based_calibration
-from .errors import InputError
+from .calibration.calibration import Calibration
+from .errors import ExtrapolationWarning, InputError
 from .imaging.catalog import SourceCatalog
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
 from .imaging.distortion import PolynomialDistortion
@@ -36,6 +37,7 @@ from .sampling.sampler import sample
 
 __all__ = [
     "BackgroundNoise",
+    "Calibration",
     "Cause",
     "Chain",
     "Comparison",
@@ -44,6 +46,7 @@ __all__ = [
     "Diagnostics",
     "DisplacementField",
     "Evidence",
+    "ExtrapolationWarning",
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",

@@ -1,4 +1,7 @@
-"""The exception for input that a user can correct; the command line prints it and exits with 2."""
+"""The exception for input that a user can correct, and the warning of a result that says little.
+
+The command line prints the exception and exits with 2.
+"""
 
 
 def printable(text: str) -> str:
@@ -33,3 +36,7 @@ class InputError(ValueError):
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text))
+
+
+class ExtrapolationWarning(UserWarning):
+    """Points are beyond the sources: only the terms of the distortion say what happens there."""

@@ -32,6 +32,9 @@ __all__ = [
     "displacement_field",
     "field_error",
     "field_points",
+    "hull_of",
+    "images_of",
+    "inside_hull",
     "pixel_unit",
     "rms",
 ]
@@ -153,8 +156,8 @@ def field_points(posterior: Posterior, params: Floats) -> FieldPoints:
     longer = max(half_u, half_v)
     columns, rows = (max(2, math.ceil((POINTS - 1) * h / longer) + 1) for h in (half_u, half_v))
     u, v = np.meshgrid(np.linspace(-half_u, half_u, columns), np.linspace(-half_v, half_v, rows))
-    hull = _hull(_images(posterior, params))
-    inside = _inside(hull, u, v)
+    hull = hull_of(images_of(posterior, params))
+    inside = inside_hull(hull, u, v)
     edge_u, edge_v = (np.isin(np.arange(n), (0, n - 1)) for n in (columns, rows))
     weights = np.where(edge_u, 0.5, 1.0) * np.where(edge_v, 0.5, 1.0)[:, None]
     return FieldPoints(u, v, hull, inside, weights * inside if inside.any() else weights)
@@ -238,8 +241,19 @@ def _sd(covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(0.5 * np.trace(covariance, axis1=-2, axis2=-1)))
 
 
-def _images(posterior: Posterior, params: Floats) -> Floats:
-    """Where the sources are imaged on pixels of the likelihood, shape (n, 2), pixel."""
+def images_of(posterior: Posterior, params: Floats) -> Floats:
+    """Where the sources are imaged on pixels of the likelihood.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+
+    Returns
+    -------
+    ndarray, shape (n, 2), pixel of the fine grid
+        u and v.
+    """
     detector, at = posterior.model.detector, posterior.likelihood.image_positions(params)
     at = at[np.isfinite(at).all(axis=1)]
     shape = np.array(detector.shape[::-1])
@@ -249,16 +263,38 @@ def _images(posterior: Posterior, params: Floats) -> Floats:
     return np.asarray(at[kept][posterior.mask[row, column]])
 
 
-def _hull(images: Floats) -> Floats:
-    """Vertices of the convex hull, counterclockwise, shape (n, 2)."""
+def hull_of(images: Floats) -> Floats:
+    """Vertices of the convex hull of points, counterclockwise.
+
+    Parameters
+    ----------
+    images : ndarray, shape (n, 2)
+
+    Returns
+    -------
+    ndarray, shape (k, 2)
+        None if there are fewer than three points, or all are on a line.
+    """
     try:
         return np.asarray(images[spatial.ConvexHull(images).vertices])
     except (spatial.QhullError, ValueError):  # fewer than three, or on a line
         return np.empty((0, 2))
 
 
-def _inside(hull: Floats, u: Floats, v: Floats) -> Flags:
-    """Whether points lie to the left of every edge, or on it."""
+def inside_hull(hull: Floats, u: Floats, v: Floats) -> Flags:
+    """Whether points lie within a convex hull, or on an edge.
+
+    Parameters
+    ----------
+    hull : ndarray, shape (k, 2)
+        Vertices, counterclockwise.
+    u, v : ndarray, shape (...)
+
+    Returns
+    -------
+    ndarray of bool, shape (...)
+        False if the hull has no vertices.
+    """
     inside = np.full(u.shape, len(hull) > 0)
     for (u_0, v_0), (u_1, v_1) in zip(hull, np.roll(hull, -1, axis=0), strict=True):
         length = math.hypot(u_1 - u_0, v_1 - v_0)

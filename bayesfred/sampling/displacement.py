@@ -21,7 +21,7 @@ from bayesfred.model.posterior import Posterior
 if TYPE_CHECKING:
     from bayesfred.sampling.chain import Chain
 
-__all__ = ["displacement", "frame_posterior"]
+__all__ = ["displacement", "frame_posterior", "spread_draws"]
 
 # A standard deviation of this many independent draws has an error of 2.2 %, a variance of 4.5 %.
 MOST_DRAWS = 1000
@@ -61,10 +61,7 @@ def displacement(chain: "Chain", u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Fl
             f"u, v: got {np.shape(u)} and {np.shape(v)}, expected numbers that can be broadcast "
             "against each other"
         ) from None
-    draws = chain.draws()
-    if len(draws) > MOST_DRAWS:  # at random within each block, as walkers stand in turn
-        part = (np.arange(MOST_DRAWS) + np.random.default_rng(0).random(MOST_DRAWS)) / MOST_DRAWS
-        draws = draws[(part * len(draws)).astype(int)]
+    draws = spread_draws(chain)
     theta, offset = displacing(posterior.parameters, draws)
     points = np.stack([u.ravel(), v.ravel()])
     mean, covariance = np.empty((points.shape[1], 2)), np.empty((points.shape[1], 2, 2))
@@ -77,6 +74,25 @@ def displacement(chain: "Chain", u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Fl
         off = found - found.mean(axis=1, keepdims=True)
         covariance[some] = np.einsum("inp,jnp->pij", off, off) / (len(draws) - 1)
     return mean.reshape(*u.shape, 2), covariance.reshape(*u.shape, 2, 2)
+
+
+def spread_draws(chain: "Chain") -> Floats:
+    """At most 1,000 of a chain's draws after burn-in, spread over it.
+
+    Parameters
+    ----------
+    chain : Chain
+
+    Returns
+    -------
+    ndarray, shape (n, d), parameter units
+    """
+    draws = chain.draws()
+    if len(draws) <= MOST_DRAWS:
+        return draws
+    # at random within each block, as walkers stand in turn
+    part = (np.arange(MOST_DRAWS) + np.random.default_rng(0).random(MOST_DRAWS)) / MOST_DRAWS
+    return np.asarray(draws[(part * len(draws)).astype(int)])
 
 
 def frame_posterior(chain: "Chain") -> Posterior:

@@ -1,0 +1,434 @@
+"""The calibration of an instrument: positions in both directions, with their covariance.
+
+A chain holds a frame, its draws and everything needed to replay them. A `Calibration` holds what
+others need to use them: the distortion, the mean, covariance and draws of its coefficients, the
+detector, the PSF and where the object plane is on the sky. To first order the covariance of a
+position is that of the delta method,
+
+    cov(x, y) = A^-1 B C B^T A^-T,    cov(u, v) = D^-1 B C B^T D^-T,
+
+with C the covariance of the coefficients and the offset, B the derivatives of a and b with respect
+to them, and A and D the matrices of `imaging/inverse`. The draws give the same without an
+approximation, for few points. `maps` evaluates a calibration over the field, `exports` writes it
+for other tools, and `correct` resamples frames with it.
+"""
+
+import io
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Self
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+from astropy import units
+from astropy.coordinates import SkyCoord
+
+from bayesfred._typing import Flags, Floats, PathLike
+from bayesfred.analysis.diagnostics import diagnose
+from bayesfred.analysis.field import hull_of, images_of, inside_hull
+from bayesfred.errors import ExtrapolationWarning, InputError
+from bayesfred.imaging.detector import Detector
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.inverse import slopes
+from bayesfred.imaging.psf.protocol import PSF
+from bayesfred.io import atomic
+from bayesfred.io.hdf5_checks import CALIBRATION, SCHEMA, open_checked, seal
+from bayesfred.io.paths import may_write
+from bayesfred.io.serialize import read, serializable, write
+from bayesfred.io.sky import icrs
+from bayesfred.io.tangent_plane import TangentPlane
+from bayesfred.model.parameters import displacing
+from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.displacement import frame_posterior, spread_draws
+
+__all__ = ["Calibration", "Method"]
+
+Method = Literal["delta", "draws"]
+BLOCK = 2**13  # points whose covariances are computed at once: what fits the caches
+
+
+@serializable("calibration")
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Where a pixel points, and where an object is imaged, with errors.
+
+    Points of both planes are in pixels of the fine grid from the middle of the frame: u and x along
+    columns, v and y along rows. The array index of a recorded pixel is u / binning + (columns - 1)
+    / 2; `index` and `from_index` convert.
+
+    Parameters
+    ----------
+    distortion : PolynomialDistortion
+    draws : array_like, shape (n, n_terms + 2)
+        Draws of its coefficients and of the offset (pixel) along x and y, n > 1.
+    detector : Detector
+    psf : PSF
+    psf_sigma : float, pixel
+        The width that it was found to have: the PSF widens as a whole.
+    sources : array_like, shape (k, 2), pixel of the fine grid
+        u and v of the images from which the distortion is known. Outside their convex hull only
+        its terms say what happens.
+    sky : TangentPlane, optional
+        Where the object plane is on the sky.
+    title, message : str
+        What was calibrated, and whether the fit can be trusted.
+
+    Raises
+    ------
+    InputError
+        If the draws are not finite, or not one value for each coefficient and the offset.
+
+    Examples
+    --------
+    >>> import bayesfred as bf
+    >>> model = bf.ForwardModel(
+    ...     bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(3.0),
+    ...     bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]))
+    >>> posterior = bf.Posterior(model, bf.simulate(model, [0.02, 0.02], 2.0, seed=1))
+    >>> calibration = Calibration.from_chain(bf.laplace(posterior, seed=1))
+    >>> x, y, covariance = calibration.to_object([10.0], [20.0])
+    >>> print(x.round(1), y.round(1), covariance[0].round(4))
+    [10.2] [20.4] [[0.0001 0.    ]
+     [0.     0.0002]]
+    """
+
+    distortion: PolynomialDistortion
+    draws: Floats
+    detector: Detector
+    psf: PSF
+    psf_sigma: float
+    sources: Floats
+    sky: TangentPlane | None = None
+    title: str = ""
+    message: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("draws", "sources"):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        width = self.distortion.n_terms + 2
+        if self.draws.ndim != 2 or self.draws.shape[1] != width or len(self.draws) < 2:
+            raise InputError(
+                f"draws: got shape {self.draws.shape}, expected (n, {width}) with n > 1: one value "
+                "for each coefficient and two for the offset"
+            )
+        if self.sources.ndim != 2 or self.sources.shape[1] != 2:
+            raise InputError(f"sources: got shape {self.sources.shape}, expected (k, 2)")
+        if not (np.isfinite(self.draws).all() and np.isfinite(self.sources).all()):
+            raise InputError("draws, sources: got values that are not finite, expected numbers")
+
+    @classmethod
+    def from_chain(cls, chain: Chain) -> Self:
+        """The calibration that a chain tells.
+
+        Parameters
+        ----------
+        chain : Chain
+            Of a frame.
+
+        Returns
+        -------
+        Calibration
+            With at most 1,000 of the chain's draws.
+
+        Raises
+        ------
+        InputError
+            If the chain is of a density that is no frame's.
+        """
+        posterior, draws = frame_posterior(chain), spread_draws(chain)
+        theta, offset = displacing(posterior.parameters, draws)
+        psf, names = posterior.model.psf, chain.parameter_names
+        free = "psf_sigma" in names
+        width = float(draws[:, names.index("psf_sigma")].mean()) if free else psf.sigma
+        return cls(
+            posterior.model.polynomial,
+            np.hstack([theta, offset]),
+            posterior.model.detector,
+            psf,
+            width,
+            images_of(posterior, chain.estimate.params),
+            posterior.model.sources.sky,
+            chain.record.title if chain.record else "",
+            diagnose(chain, target_ess=chain.target_ess).message,
+        )
+
+    @classmethod
+    def read(cls, path: PathLike) -> "Calibration":
+        """Read a calibration that `write` wrote.
+
+        Parameters
+        ----------
+        path : path-like
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        InputError
+            If the file is missing, is no calibration, or was changed or damaged since.
+        """
+        with open_checked(Path(path), CALIBRATION) as file:
+            return read(file["calibration"], Calibration)
+
+    def write(self, path: PathLike, *, overwrite: bool = False) -> None:
+        """Write the calibration as one HDF5 file, which needs no frame to be used.
+
+        Parameters
+        ----------
+        path : path-like
+        overwrite : bool
+            Replace a file that exists.
+
+        Raises
+        ------
+        InputError
+            If the file exists or cannot be written, or cannot hold such a PSF.
+        """
+        path = Path(path)
+        may_write(path, overwrite=overwrite)
+        content = io.BytesIO()
+        with h5py.File(content, "w", libver=("v110", "v110")) as file:
+            file.attrs.update(kind=np.bytes_(CALIBRATION), schema=SCHEMA)
+            write(file.create_group("calibration"), self)
+        with content.getbuffer() as written:
+            atomic.replace(path, written, seal(written))
+
+    @property
+    def mean(self) -> Floats:
+        """Posterior mean of the coefficients and the offset, shape (n_terms + 2,)."""
+        return np.asarray(self.draws.mean(axis=0))
+
+    @property
+    def covariance(self) -> Floats:
+        """Their posterior covariance, shape (n_terms + 2, n_terms + 2)."""
+        return np.atleast_2d(np.cov(self.draws, rowvar=False))
+
+    def to_image(
+        self, x: npt.ArrayLike, y: npt.ArrayLike, *, method: Method = "delta"
+    ) -> tuple[Floats, Floats, Floats]:
+        """Where object points are imaged.
+
+        Parameters
+        ----------
+        x, y : array_like, pixel of the fine grid
+            Broadcast against each other.
+        method : {"delta", "draws"}
+            The delta method about the posterior mean; or mean and covariance of the positions of
+            all draws, which is slower by their number.
+
+        Returns
+        -------
+        u, v : ndarray, the broadcast shape, pixel
+            NaN where no image is found.
+        covariance : ndarray, shape (..., 2, 2), pixel^2
+            Of the calibration alone, not of the object's position.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Some of the points are beyond the sources.
+        """
+        found = self._image(*_points(x, y), method)
+        self._warn(*found[:2])
+        return found
+
+    def to_object(
+        self, u: npt.ArrayLike, v: npt.ArrayLike, *, method: Method = "delta"
+    ) -> tuple[Floats, Floats, Floats]:
+        """Which object points are imaged at (u, v).
+
+        Parameters
+        ----------
+        u, v : array_like, pixel of the fine grid
+            Broadcast against each other.
+        method : {"delta", "draws"}
+            As for `to_image`.
+
+        Returns
+        -------
+        x, y : ndarray, the broadcast shape, pixel
+            NaN where no object is imaged.
+        covariance : ndarray, shape (..., 2, 2), pixel^2
+            Of the calibration alone, not of a measured (u, v).
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Some of the points are beyond the sources.
+        """
+        u, v = _points(u, v)
+        self._warn(u, v)
+        return self._object(u, v, method)
+
+    def to_sky(
+        self, u: npt.ArrayLike, v: npt.ArrayLike, *, method: Method = "delta"
+    ) -> tuple[SkyCoord, Floats]:
+        """Where pixels point on the sky.
+
+        Parameters
+        ----------
+        u, v : array_like, pixel of the fine grid
+            Broadcast against each other.
+        method : {"delta", "draws"}
+            As for `to_image`.
+
+        Returns
+        -------
+        coordinates : SkyCoord, the broadcast shape
+            ICRS.
+        covariance : ndarray, shape (..., 2, 2), arcsec^2
+            Along east and north.
+
+        Raises
+        ------
+        InputError
+            If it is not known where the object plane is on the sky.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Some of the points are beyond the sources.
+        """
+        sky = self._known_sky()
+        u, v = _points(u, v)
+        self._warn(u, v)
+        x, y, covariance = self._object(u, v, method)
+        jacobian = sky.jacobian(x, y)
+        at = SkyCoord(*(angle * units.deg for angle in sky.to_sky(x, y)))
+        return at, jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
+
+    def to_pixel(
+        self, coordinates: SkyCoord, *, method: Method = "delta"
+    ) -> tuple[Floats, Floats, Floats]:
+        """Where directions on the sky are imaged.
+
+        Parameters
+        ----------
+        coordinates : SkyCoord
+        method : {"delta", "draws"}
+            As for `to_image`.
+
+        Returns
+        -------
+        u, v : ndarray, the shape of the coordinates, pixel of the fine grid
+            NaN where no image is found.
+        covariance : ndarray, shape (..., 2, 2), pixel^2
+
+        Raises
+        ------
+        InputError
+            If it is not known where the object plane is on the sky.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Some of the images are beyond the sources.
+        """
+        found = self._image(*self._known_sky().to_plane(*icrs(coordinates)), method)
+        self._warn(*found[:2])
+        return found
+
+    def index(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Floats, Floats]:
+        """Array indices (column, row) of image points, counted from 0 at a pixel's centre."""
+        ny, nx = self.detector.shape
+        column, row = (np.asarray(p, np.float64) / self.detector.binning for p in (u, v))
+        return column + 0.5 * (nx - 1), row + 0.5 * (ny - 1)
+
+    def from_index(self, column: npt.ArrayLike, row: npt.ArrayLike) -> tuple[Floats, Floats]:
+        """Image points (u, v) of array indices: the inverse of `index`."""
+        ny, nx = self.detector.shape
+        u, v = np.asarray(column, np.float64), np.asarray(row, np.float64)
+        binning = self.detector.binning
+        return (u - 0.5 * (nx - 1)) * binning, (v - 0.5 * (ny - 1)) * binning
+
+    def inside(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Flags:
+        """Whether image points lie within the convex hull of the sources' images."""
+        return inside_hull(hull_of(self.sources), *_points(u, v))
+
+    def _known_sky(self) -> TangentPlane:
+        if self.sky is None:
+            raise InputError(
+                "sky: got a calibration whose object plane has no place on the sky, expected one "
+                "of a catalogue with ra and dec"
+            )
+        return self.sky
+
+    def _image(self, x: Floats, y: Floats, method: Method) -> tuple[Floats, Floats, Floats]:
+        if method == "draws":
+            return self._of_draws(x, y, images=True)
+        mean = self.mean
+        u, v = self.distortion.image_position(mean[:-2], x, y, offset=mean[-2:])
+        return u, v, self._covariance((u, v, x, y), images=True)
+
+    def _object(self, u: Floats, v: Floats, method: Method) -> tuple[Floats, Floats, Floats]:
+        if method == "draws":
+            return self._of_draws(u, v, images=False)
+        mean = self.mean
+        x, y = self.distortion.object_position(mean[:-2], u, v, offset=mean[-2:])
+        return x, y, self._covariance((u, v, x, y), images=False)
+
+    def _of_draws(self, p: Floats, q: Floats, *, images: bool) -> tuple[Floats, Floats, Floats]:
+        """Mean and covariance of the positions that the draws give."""
+        to = self.distortion.image_position if images else self.distortion.object_position
+        found = np.array(to(self.draws[:, :-2], p, q, offset=self.draws[:, -2:]))
+        mean = found.mean(axis=1)
+        off = found - mean[:, None]
+        covariance = np.einsum("in...,jn...->...ij", off, off) / (len(self.draws) - 1)
+        return mean[0], mean[1], covariance
+
+    def _covariance(self, at: tuple[Floats, ...], *, images: bool) -> Floats:
+        """The delta method at points (u, v, x, y), shape (..., 2, 2)."""
+        theta = self.distortion.monomial_coefficients(self.mean[None, :-2])
+        split = len(self.distortion.f_terms)
+        f = theta[:, :split], self.distortion.f_terms
+        g = theta[:, split:], self.distortion.g_terms
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))  # C = root root^T
+        flat = [np.ravel(p) for p in at]
+        out = np.empty((flat[0].size, 2, 2))
+        for first in range(0, flat[0].size, BLOCK):
+            some = [p[first : first + BLOCK] for p in flat]
+            design = self.distortion.design_matrix(*some)
+            a, b = (design[k] @ root[:-2] - root[-2 + k] for k in (0, 1))
+            left, right = np.sum(a * a, axis=1), np.sum(b * b, axis=1)
+            cross = np.sum(a * b, axis=1)
+            m = slopes(f, g, (some[0], some[1], some[2], some[3]), images=images)
+            determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+            inverse = np.empty_like(m)
+            inverse[:, 0, 0], inverse[:, 1, 1] = m[:, 1, 1], m[:, 0, 0]
+            inverse[:, 0, 1], inverse[:, 1, 0] = -m[:, 0, 1], -m[:, 1, 0]
+            inverse /= determinant[:, None, None]
+            middle = np.moveaxis(np.array([[left, cross], [cross, right]]), 2, 0)
+            out[first : first + BLOCK] = inverse @ middle @ inverse.swapaxes(1, 2)
+        return out.reshape(*at[0].shape, 2, 2)
+
+    def _warn(self, u: Floats, v: Floats) -> None:
+        """Say how many points are beyond the sources."""
+        beyond = int(np.sum(~self.inside(u, v)))
+        if beyond:
+            warnings.warn(
+                f"{beyond} of {u.size} points are beyond the sources, where only the terms of the "
+                "distortion say what happens",
+                ExtrapolationWarning,
+                stacklevel=3,
+            )
+
+
+def _points(p: npt.ArrayLike, q: npt.ArrayLike) -> tuple[Floats, Floats]:
+    """Two arrays of one shape."""
+    try:
+        first, second = np.broadcast_arrays(
+            np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
+        )
+    except (TypeError, ValueError):
+        raise InputError(
+            f"points: got {np.shape(p)} and {np.shape(q)}, expected numbers that can be broadcast "
+            "against each other"
+        ) from None
+    return first, second
