@@ -18,10 +18,10 @@ from test_model import make_model, make_posterior, make_truth
 import bayesfred as bf
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.io.sealed import FORMAT
 from bayesfred.io.serialize import kinds, read, serializable, write
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.sampling.chainfile import FORMAT
 
 
 class Shape(Protocol):

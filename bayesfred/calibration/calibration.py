@@ -2,24 +2,16 @@
 
 A chain holds a frame, its draws and everything needed to replay them. A `Calibration` holds what
 others need to use them: the distortion, the mean, covariance and draws of its coefficients, the
-detector, the PSF and where the object plane is on the sky. To first order the covariance of a
-position is that of the delta method,
-
-    cov(x, y) = A^-1 B C B^T A^-T,    cov(u, v) = D^-1 B C B^T D^-T,
-
-with C the covariance of the coefficients and the offset, B the derivatives of a and b with respect
-to them, and A and D the matrices of `imaging/inverse`. The draws give the same without an
-approximation, for few points. `maps` evaluates a calibration over the field, `exports` writes it
-for other tools, and `correct` resamples frames with it.
+detector, the PSF and where the object plane is on the sky. `positions` does the
+computing, `maps` evaluates a calibration over the field, `difference` compares two of one camera,
+`exports` writes it for other tools, and `correct` resamples frames with it.
 """
 
-import io
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 from astropy import units
@@ -28,25 +20,24 @@ from astropy.coordinates import SkyCoord
 from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.field import hull_of, images_of, inside_hull
+from bayesfred.calibration.difference import CalibrationDifference, difference
+from bayesfred.calibration.maps import DisplacementMap, PSFMap, displacement_map, psf_map
+from bayesfred.calibration.positions import Method, Positions, broadcast_points
 from bayesfred.errors import ExtrapolationWarning, InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
-from bayesfred.imaging.inverse import slopes
 from bayesfred.imaging.psf.protocol import PSF
-from bayesfred.io import atomic
-from bayesfred.io.hdf5_checks import CALIBRATION, SCHEMA, open_checked, seal
+from bayesfred.io.hdf5_checks import CALIBRATION
 from bayesfred.io.paths import may_write
-from bayesfred.io.serialize import read, serializable, write
+from bayesfred.io.sealed import read_sealed, write_sealed
+from bayesfred.io.serialize import serializable
 from bayesfred.io.sky import icrs
 from bayesfred.io.tangent_plane import TangentPlane
 from bayesfred.model.parameters import displacing
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.displacement import frame_posterior, spread_draws
 
-__all__ = ["Calibration", "Method"]
-
-Method = Literal["delta", "draws"]
-BLOCK = 2**13  # points whose covariances are computed at once: what fits the caches
+__all__ = ["Calibration"]
 
 
 @serializable("calibration")
@@ -88,10 +79,9 @@ class Calibration:
     ...     bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]))
     >>> posterior = bf.Posterior(model, bf.simulate(model, [0.02, 0.02], 2.0, seed=1))
     >>> calibration = Calibration.from_chain(bf.laplace(posterior, seed=1))
-    >>> x, y, covariance = calibration.to_object([10.0], [20.0])
-    >>> print(x.round(1), y.round(1), covariance[0].round(4))
-    [10.2] [20.4] [[0.0001 0.    ]
-     [0.     0.0002]]
+    >>> x, y, covariance = calibration.to_object([10.0], [5.0])
+    >>> print(x.round(1), y.round(1), (covariance[0, 0, 0] ** 0.5).round(3))
+    [10.2] [5.1] 0.007
     """
 
     distortion: PolynomialDistortion
@@ -173,8 +163,7 @@ class Calibration:
         InputError
             If the file is missing, is no calibration, or was changed or damaged since.
         """
-        with open_checked(Path(path), CALIBRATION) as file:
-            return read(file["calibration"], Calibration)
+        return read_sealed(Path(path), CALIBRATION, Calibration)
 
     def write(self, path: PathLike, *, overwrite: bool = False) -> None:
         """Write the calibration as one HDF5 file, which needs no frame to be used.
@@ -190,24 +179,13 @@ class Calibration:
         InputError
             If the file exists or cannot be written, or cannot hold such a PSF.
         """
-        path = Path(path)
         may_write(path, overwrite=overwrite)
-        content = io.BytesIO()
-        with h5py.File(content, "w", libver=("v110", "v110")) as file:
-            file.attrs.update(kind=np.bytes_(CALIBRATION), schema=SCHEMA)
-            write(file.create_group("calibration"), self)
-        with content.getbuffer() as written:
-            atomic.replace(path, written, seal(written))
+        write_sealed(Path(path), CALIBRATION, self)
 
     @property
-    def mean(self) -> Floats:
-        """Posterior mean of the coefficients and the offset, shape (n_terms + 2,)."""
-        return np.asarray(self.draws.mean(axis=0))
-
-    @property
-    def covariance(self) -> Floats:
-        """Their posterior covariance, shape (n_terms + 2, n_terms + 2)."""
-        return np.atleast_2d(np.cov(self.draws, rowvar=False))
+    def positions(self) -> Positions:
+        """The map between both planes, with its errors."""
+        return Positions(self.distortion, self.draws)
 
     def to_image(
         self, x: npt.ArrayLike, y: npt.ArrayLike, *, method: Method = "delta"
@@ -234,7 +212,7 @@ class Calibration:
         ExtrapolationWarning
             Some of the points are beyond the sources.
         """
-        found = self._image(*_points(x, y), method)
+        found = self.positions.image(*broadcast_points(x, y), method)
         self._warn(*found[:2])
         return found
 
@@ -262,9 +240,9 @@ class Calibration:
         ExtrapolationWarning
             Some of the points are beyond the sources.
         """
-        u, v = _points(u, v)
+        u, v = broadcast_points(u, v)
         self._warn(u, v)
-        return self._object(u, v, method)
+        return self.positions.object(u, v, method)
 
     def to_sky(
         self, u: npt.ArrayLike, v: npt.ArrayLike, *, method: Method = "delta"
@@ -296,9 +274,9 @@ class Calibration:
             Some of the points are beyond the sources.
         """
         sky = self._known_sky()
-        u, v = _points(u, v)
+        u, v = broadcast_points(u, v)
         self._warn(u, v)
-        x, y, covariance = self._object(u, v, method)
+        x, y, covariance = self.positions.object(u, v, method)
         jacobian = sky.jacobian(x, y)
         at = SkyCoord(*(angle * units.deg for angle in sky.to_sky(x, y)))
         return at, jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
@@ -330,7 +308,7 @@ class Calibration:
         ExtrapolationWarning
             Some of the images are beyond the sources.
         """
-        found = self._image(*self._known_sky().to_plane(*icrs(coordinates)), method)
+        found = self.positions.image(*self._known_sky().to_plane(*icrs(coordinates)), method)
         self._warn(*found[:2])
         return found
 
@@ -347,9 +325,56 @@ class Calibration:
         binning = self.detector.binning
         return (u - 0.5 * (nx - 1)) * binning, (v - 0.5 * (ny - 1)) * binning
 
+    def displacement_map(self, step: float) -> DisplacementMap:
+        """The displacement and its covariance on a grid over the frame.
+
+        Parameters
+        ----------
+        step : float, pixel of the fine grid
+
+        Returns
+        -------
+        DisplacementMap
+        """
+        return displacement_map(self, step)
+
+    def psf_map(self, step: float) -> PSFMap:
+        """Size and ellipticity of the images of point sources on a grid over the frame.
+
+        Parameters
+        ----------
+        step : float, pixel of the fine grid
+
+        Returns
+        -------
+        PSFMap
+        """
+        return psf_map(self, step)
+
+    def difference(self, other: "Calibration") -> CalibrationDifference:
+        """Whether the camera has changed between two calibrations.
+
+        Parameters
+        ----------
+        other : Calibration
+            Of another frame, so that its errors are independent.
+
+        Returns
+        -------
+        CalibrationDifference
+            Of `other` less this one.
+
+        Raises
+        ------
+        InputError
+            If the frames have different sizes, one alone has a place on the sky, or the sources of
+            both have too little of the field in common.
+        """
+        return difference(self, other)
+
     def inside(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Flags:
         """Whether image points lie within the convex hull of the sources' images."""
-        return inside_hull(hull_of(self.sources), *_points(u, v))
+        return inside_hull(hull_of(self.sources), *broadcast_points(u, v))
 
     def _known_sky(self) -> TangentPlane:
         if self.sky is None:
@@ -358,55 +383,6 @@ class Calibration:
                 "of a catalogue with ra and dec"
             )
         return self.sky
-
-    def _image(self, x: Floats, y: Floats, method: Method) -> tuple[Floats, Floats, Floats]:
-        if method == "draws":
-            return self._of_draws(x, y, images=True)
-        mean = self.mean
-        u, v = self.distortion.image_position(mean[:-2], x, y, offset=mean[-2:])
-        return u, v, self._covariance((u, v, x, y), images=True)
-
-    def _object(self, u: Floats, v: Floats, method: Method) -> tuple[Floats, Floats, Floats]:
-        if method == "draws":
-            return self._of_draws(u, v, images=False)
-        mean = self.mean
-        x, y = self.distortion.object_position(mean[:-2], u, v, offset=mean[-2:])
-        return x, y, self._covariance((u, v, x, y), images=False)
-
-    def _of_draws(self, p: Floats, q: Floats, *, images: bool) -> tuple[Floats, Floats, Floats]:
-        """Mean and covariance of the positions that the draws give."""
-        to = self.distortion.image_position if images else self.distortion.object_position
-        found = np.array(to(self.draws[:, :-2], p, q, offset=self.draws[:, -2:]))
-        mean = found.mean(axis=1)
-        off = found - mean[:, None]
-        covariance = np.einsum("in...,jn...->...ij", off, off) / (len(self.draws) - 1)
-        return mean[0], mean[1], covariance
-
-    def _covariance(self, at: tuple[Floats, ...], *, images: bool) -> Floats:
-        """The delta method at points (u, v, x, y), shape (..., 2, 2)."""
-        theta = self.distortion.monomial_coefficients(self.mean[None, :-2])
-        split = len(self.distortion.f_terms)
-        f = theta[:, :split], self.distortion.f_terms
-        g = theta[:, split:], self.distortion.g_terms
-        values, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))  # C = root root^T
-        flat = [np.ravel(p) for p in at]
-        out = np.empty((flat[0].size, 2, 2))
-        for first in range(0, flat[0].size, BLOCK):
-            some = [p[first : first + BLOCK] for p in flat]
-            design = self.distortion.design_matrix(*some)
-            a, b = (design[k] @ root[:-2] - root[-2 + k] for k in (0, 1))
-            left, right = np.sum(a * a, axis=1), np.sum(b * b, axis=1)
-            cross = np.sum(a * b, axis=1)
-            m = slopes(f, g, (some[0], some[1], some[2], some[3]), images=images)
-            determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
-            inverse = np.empty_like(m)
-            inverse[:, 0, 0], inverse[:, 1, 1] = m[:, 1, 1], m[:, 0, 0]
-            inverse[:, 0, 1], inverse[:, 1, 0] = -m[:, 0, 1], -m[:, 1, 0]
-            inverse /= determinant[:, None, None]
-            middle = np.moveaxis(np.array([[left, cross], [cross, right]]), 2, 0)
-            out[first : first + BLOCK] = inverse @ middle @ inverse.swapaxes(1, 2)
-        return out.reshape(*at[0].shape, 2, 2)
 
     def _warn(self, u: Floats, v: Floats) -> None:
         """Say how many points are beyond the sources."""
@@ -418,17 +394,3 @@ class Calibration:
                 ExtrapolationWarning,
                 stacklevel=3,
             )
-
-
-def _points(p: npt.ArrayLike, q: npt.ArrayLike) -> tuple[Floats, Floats]:
-    """Two arrays of one shape."""
-    try:
-        first, second = np.broadcast_arrays(
-            np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
-        )
-    except (TypeError, ValueError):
-        raise InputError(
-            f"points: got {np.shape(p)} and {np.shape(q)}, expected numbers that can be broadcast "
-            "against each other"
-        ) from None
-    return first, second

@@ -68,8 +68,8 @@ def open_checked(path: Path, kind: bytes = KIND) -> Iterator[h5py.File]:
     Raises
     ------
     InputError
-        If the file is missing, is of another kind, was changed or damaged since it was written, is of
-        another schema, or holds anything but plain arrays and attributes; and if what is read from
+        If the file is missing, of another kind or schema, was changed or damaged since it was
+        written, or holds anything but plain arrays and attributes; and if what is read from
         it within the `with` block makes no sense.
     """
     if not path.is_file():

@@ -21,15 +21,13 @@ from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
 from bayesfred.io import atomic
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
+from bayesfred.io.sealed import FORMAT
 from bayesfred.io.serialize import read, write, write_array
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.sampling.chain import Chain, Method
 from bayesfred.sampling.record import RunRecord
-
-# The oldest format that keeps small files small; every HDF5 since 1.10 (2016) reads it.
-FORMAT = ("v110", "v110")
 
 
 def open_chain(path: PathLike) -> Chain:

@@ -1,0 +1,170 @@
+"""Positions on both planes with their covariance, from draws of a distortion's coefficients.
+
+To first order the covariance of a position is that of the delta method,
+
+    cov(x, y) = A^-1 B C B^T A^-T,    cov(u, v) = D^-1 B C B^T D^-T,
+
+with C the covariance of the coefficients and the offset, B the derivatives of a and b with respect
+to them, and A and D the matrices of `imaging/inverse`. The draws give the same without that
+approximation, for few points.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from bayesfred._typing import Floats
+from bayesfred.errors import InputError
+from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.imaging.inverse import slopes
+
+__all__ = ["Method", "Positions", "broadcast_points"]
+
+Method = Literal["delta", "draws"]
+BLOCK = 2**13  # points whose covariances are computed at once: what fits the caches
+
+
+@dataclass(frozen=True, eq=False)
+class Positions:
+    """The map between object and image plane.
+
+    Parameters
+    ----------
+    distortion : PolynomialDistortion
+    draws : ndarray, shape (n, n_terms + 2)
+        Draws of its coefficients and of the offset (pixel).
+    """
+
+    distortion: PolynomialDistortion
+    draws: Floats
+
+    @cached_property
+    def mean(self) -> Floats:
+        """Mean of the coefficients and the offset, shape (n_terms + 2,)."""
+        return np.asarray(self.draws.mean(axis=0))
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Their covariance, shape (n_terms + 2, n_terms + 2)."""
+        return np.atleast_2d(np.cov(self.draws, rowvar=False))
+
+    def image(
+        self, x: Floats, y: Floats, method: Method = "delta"
+    ) -> tuple[Floats, Floats, Floats]:
+        """Images of object points, as `Calibration.to_image`.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape (...), pixel of the fine grid
+        method : {"delta", "draws"}
+
+        Returns
+        -------
+        u, v : ndarray, shape (...), pixel
+        covariance : ndarray, shape (..., 2, 2), pixel^2
+        """
+        if method == "draws":
+            return self._of_draws(x, y, images=True)
+        u, v = self.distortion.image_position(self.mean[:-2], x, y, offset=self.mean[-2:])
+        return u, v, self._delta((u, v, x, y), images=True)
+
+    def object(
+        self, u: Floats, v: Floats, method: Method = "delta"
+    ) -> tuple[Floats, Floats, Floats]:
+        """Objects that are imaged at points, as `Calibration.to_object`.
+
+        Parameters
+        ----------
+        u, v : ndarray, shape (...), pixel of the fine grid
+        method : {"delta", "draws"}
+
+        Returns
+        -------
+        x, y : ndarray, shape (...), pixel
+        covariance : ndarray, shape (..., 2, 2), pixel^2
+        """
+        if method == "draws":
+            return self._of_draws(u, v, images=False)
+        x, y = self.distortion.object_position(self.mean[:-2], u, v, offset=self.mean[-2:])
+        return x, y, self._delta((u, v, x, y), images=False)
+
+    def slope(self, at: tuple[Floats, Floats, Floats, Floats], *, images: bool = True) -> Floats:
+        """The matrix D of images, or A of objects.
+
+        Parameters
+        ----------
+        at : tuple of ndarray, shape (...), pixel
+            Image points and the objects that are imaged there: u, v, x, y.
+        images : bool
+
+        Returns
+        -------
+        ndarray, shape (..., 2, 2)
+        """
+        theta = self.distortion.monomial_coefficients(self.mean[None, :-2])
+        split = len(self.distortion.f_terms)
+        f = theta[:, :split], self.distortion.f_terms
+        g = theta[:, split:], self.distortion.g_terms
+        u, v, x, y = (np.ravel(p) for p in at)
+        return slopes(f, g, (u, v, x, y), images=images).reshape(*at[0].shape, 2, 2)
+
+    def _of_draws(self, p: Floats, q: Floats, *, images: bool) -> tuple[Floats, Floats, Floats]:
+        """Mean and covariance of the positions that the draws give."""
+        to = self.distortion.image_position if images else self.distortion.object_position
+        found = np.array(to(self.draws[:, :-2], p, q, offset=self.draws[:, -2:]))
+        mean = found.mean(axis=1)
+        off = found - mean[:, None]
+        covariance = np.einsum("in...,jn...->...ij", off, off) / (len(self.draws) - 1)
+        return mean[0], mean[1], covariance
+
+    def _delta(self, at: tuple[Floats, Floats, Floats, Floats], *, images: bool) -> Floats:
+        """The covariance to first order at points u, v, x, y, shape (..., 2, 2)."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))  # C = root root^T
+        u, v, x, y = (np.ravel(p) for p in at)
+        out = np.empty((u.size, 2, 2))
+        for first in range(0, u.size, BLOCK):
+            some = slice(first, first + BLOCK)
+            part = u[some], v[some], x[some], y[some]
+            design = self.distortion.design_matrix(*part)
+            a, b = (design[k] @ root[:-2] - root[-2 + k] for k in (0, 1))
+            sums = [[np.sum(p * q, axis=1) for q in (a, b)] for p in (a, b)]
+            m = self.slope(part, images=images)
+            inverse = np.empty_like(m)  # of many small matrices at once
+            inverse[:, 0, 0], inverse[:, 1, 1] = m[:, 1, 1], m[:, 0, 0]
+            inverse[:, 0, 1], inverse[:, 1, 0] = -m[:, 0, 1], -m[:, 1, 0]
+            determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+            inverse /= determinant[:, None, None]
+            out[some] = inverse @ np.moveaxis(np.array(sums), 2, 0) @ inverse.swapaxes(1, 2)
+        return out.reshape(*at[0].shape, 2, 2)
+
+
+def broadcast_points(p: npt.ArrayLike, q: npt.ArrayLike) -> tuple[Floats, Floats]:
+    """Two arrays of one shape.
+
+    Parameters
+    ----------
+    p, q : array_like
+
+    Returns
+    -------
+    ndarray, ndarray
+
+    Raises
+    ------
+    InputError
+        If they are no numbers, or cannot be broadcast against each other.
+    """
+    try:
+        first, second = np.broadcast_arrays(
+            np.asarray(p, dtype=np.float64), np.asarray(q, dtype=np.float64)
+        )
+    except (TypeError, ValueError):
+        raise InputError(
+            f"points: got {np.shape(p)} and {np.shape(q)}, expected numbers that can be broadcast "
+            "against each other"
+        ) from None
+    return first, second
