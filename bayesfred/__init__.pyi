@@ -3,6 +3,7 @@ from .analysis.causes import Cause, find_causes
 from .analysis.choose_terms import TermChoice, choose_terms
 from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
+from .analysis.design import Design, design
 from .analysis.diagnostics import Diagnostics, diagnose
 from .analysis.evidence import Evidence, log_evidence
 from .analysis.field import DisplacementField, displacement_field
@@ -42,6 +43,7 @@ __all__ = [
     "Chain",
     "Comparison",
     "CrossCheck",
+    "Design",
     "Detector",
     "Diagnostics",
     "DisplacementField",
@@ -75,6 +77,7 @@ __all__ = [
     "compare",
     "correct_sampling",
     "cross_check",
+    "design",
     "diagnose",
     "displacement_field",
     "find_causes",

@@ -167,6 +167,12 @@ def study(
 
 
 @app.command()
+def design(run_file: Run, overwrite: Overwrite = False) -> None:
+    """Before the exposure: the errors that a frame would have, the best sources and pointings."""
+    _run(lambda: bf.show.show_design(bf.commands.design(run_file, overwrite=overwrite)))
+
+
+@app.command()
 def report(
     chain_file: ChainFile,
     target_ess: Annotated[

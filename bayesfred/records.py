@@ -5,6 +5,7 @@ from pathlib import Path
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.comparison import Comparison
+from bayesfred.analysis.design import Design
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.analysis.field import DisplacementField
 from bayesfred.analysis.noise_study import NoiseStudy
@@ -14,7 +15,7 @@ from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
 
-__all__ = ["Compared", "Result", "Simulated", "Study"]
+__all__ = ["Compared", "Planned", "Result", "Simulated", "Study"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,22 @@ class Simulated:
     truth: Floats
     frame: Path
     catalogue: Path | None
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """What a planned frame would tell, and where it is.
+
+    Attributes
+    ----------
+    plan : Design
+    table, picture : Path
+        The files: a row for each source, the one that tells most first, and the figure.
+    """
+
+    plan: Design
+    table: Path
+    picture: Path
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from bayesfred.sections import (
     described,
     mistake,
 )
-from bayesfred.simulation_sections import SimulationSettings, StudySettings
+from bayesfred.simulation_sections import DesignSettings, SimulationSettings, StudySettings
 
 __all__ = ["PriorSettings", "RunSettings", "read_settings"]
 
@@ -246,9 +246,11 @@ class RunSettings(Section):
     prior : dict of PriorSettings
         Priors by parameter name, in place of the default ones.
     simulation : SimulationSettings, optional
-        Used by `bayesfred simulate` and `bayesfred study`.
+        Used by `bayesfred simulate`, `bayesfred study` and `bayesfred design`.
     study : StudySettings, optional
         Used by `bayesfred study` only.
+    design : DesignSettings, optional
+        Used by `bayesfred design` only.
     """
 
     frame: FrameSettings
@@ -265,16 +267,17 @@ class RunSettings(Section):
     output: OutputSettings = OutputSettings()
     simulation: SimulationSettings | None = None
     study: StudySettings | None = None
+    design: DesignSettings | None = None
 
     def seeded(self, seed: int) -> RunSettings:
-        """The same run with other random numbers, and without a study."""
+        """The same run with other random numbers, and without a study or a design."""
         parts = {"sampling": self.sampling, "simulation": self.simulation}
         update = {
             key: part.model_copy(update={"seed": seed})
             for key, part in parts.items()
             if part is not None
         }
-        return self.model_copy(update={**update, "study": None})
+        return self.model_copy(update={**update, "study": None, "design": None})
 
 
 def read_settings(path: PathLike) -> RunSettings:

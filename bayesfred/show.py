@@ -17,7 +17,7 @@ from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
 from bayesfred.proposal import Proposed
-from bayesfred.records import Compared, Result, Simulated, Study
+from bayesfred.records import Compared, Planned, Result, Simulated, Study
 from bayesfred.reporting import screen
 
 
@@ -106,6 +106,14 @@ def show_proposal(proposed: Proposed) -> bool:
     """Print what a frame's noise says, and where the run file is."""
     print(proposed.message)
     print(f"{printable(str(proposed.path))}: look at it, give it a catalogue, then bayesfred fit")
+    return True
+
+
+def show_design(planned: Planned) -> bool:
+    """Print what a planned frame would tell."""
+    _print_files(table=planned.table, picture=planned.picture)
+    for line in planned.plan.lines:
+        print(line)
     return True
 
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from bayesfred.sections import Count, Float, NotNegative, Positive, Section, Seed
 
-__all__ = ["GridSettings", "SimulationSettings", "StudySettings"]
+__all__ = ["DesignSettings", "GridSettings", "SimulationSettings", "StudySettings"]
 
 
 class GridSettings(Section):
@@ -92,4 +92,33 @@ class StudySettings(Section):
     psf_sigma: tuple[Positive, ...] | None = None
     exposure: tuple[Positive, ...] | None = None
     error: Positive = 0.01
+    path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None
+
+
+class DesignSettings(Section):
+    """`[design]`: what `bayesfred design` asks of the frame that [simulation] describes.
+
+    Attributes
+    ----------
+    error : float, pixel of the fine grid
+        The rms error of the displacement over the field, along one axis, that is wanted.
+    criterion : {'D', 'G'}
+        What a choice is judged by: the volume of the coefficients' error ellipsoid, or the largest
+        error of the displacement over the field.
+    sources : int, optional
+        How many sources to choose; by default the fewest that reach `error`, or all.
+    dithers : tuple of (float, float), pixel of the fine grid
+        Pointings to choose from, by how far each displaces the catalogue along x and y; (0, 0) is
+        the planned one.
+    frames : int, optional
+        How many frames to choose; by default the fewest that reach `error`, or one a pointing.
+    path : str, optional
+        The table of sources, .ecsv, inside the folder that the command is started in.
+    """
+
+    error: Positive = 0.01
+    criterion: Literal["D", "G"] = "D"
+    sources: Count | None = None
+    dithers: tuple[tuple[Float, Float], ...] = ()
+    frames: Count | None = None
     path: Annotated[str, Field(pattern=r"\.ecsv$")] | None = None

@@ -6,12 +6,14 @@ Every command returns a record and prints nothing. What should be known while it
 
 from bayesfred.commands.fitting import demo, fit, report, simulate_frame
 from bayesfred.commands.judging import compare, crosscheck, study, verify
+from bayesfred.commands.planning import design
 from bayesfred.proposal import init
 
 __all__ = [
     "compare",
     "crosscheck",
     "demo",
+    "design",
     "fit",
     "init",
     "report",
