@@ -1,14 +1,14 @@
 """A calibration over the field: displacement and PSF on a grid, and the FITS file of both.
 
 Near an object's image the PSF is seen through the distortion's slope D: K(u, v) = p(D (du, dv))
-|D|. Its size and shape are those of its second moments with the weight of a circular Gaussian of
-the PSF's own width, from which the weight is taken out again: with the weighted moments Q_w and the
-weight's W,
+|D|. Its shape is that of its second moments with the weight of a circular Gaussian of the PSF's own
+width, from which the weight is taken out again: with the weighted moments Q_w and the weight's W,
 
-    Q = (Q_w^-1 - W^-1)^-1,    FWHM = 2.355 det(Q)^(1/4),
-    e1 = (Q_uu - Q_vv) / (Q_uu + Q_vv),    e2 = 2 Q_uv / (Q_uu + Q_vv),
+    Q = (Q_w^-1 - W^-1)^-1,    e1 = (Q_uu - Q_vv) / (Q_uu + Q_vv),    e2 = 2 Q_uv / (Q_uu + Q_vv),
 
-which are exact for a Gaussian and finite for wide wings.
+which are exact for a Gaussian and finite for wide wings. Its size is the full width at half maximum
+of the PSF in the middle of the field without distortion, of moments Q_0, times (det Q / det
+Q_0)^(1/4).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class PSFMap:
     ----------
     u, v : ndarray, shape (columns,) and (rows,), pixel of the fine grid
     fwhm : ndarray, shape (rows, columns), pixel of the fine grid
-        Full width at half maximum of the Gaussian with the same second moments.
+        Full width at half maximum, of all directions.
     ellipticity : ndarray, shape (rows, columns, 2)
         e1 along u (positive) or v, and e2 along the diagonals; 0 for a round image.
     inside : ndarray of bool, shape (rows, columns)
@@ -104,7 +104,8 @@ def psf_map(calibration: Calibration, step: float) -> PSFMap:
     ]  # fmt: skip
     q = np.array(moments).reshape(*x.shape, 2, 2)
     with np.errstate(invalid="ignore"):
-        fwhm = FWHM * np.linalg.det(q) ** 0.25
+        plain = _moments(calibration, np.eye(2), (0.0, 0.0))
+        fwhm = FWHM * calibration.psf_sigma * (np.linalg.det(q) / np.linalg.det(plain)) ** 0.25
         trace = q[..., 0, 0] + q[..., 1, 1]
         ellipticity = np.stack(
             [(q[..., 0, 0] - q[..., 1, 1]) / trace, 2.0 * q[..., 0, 1] / trace], axis=-1
