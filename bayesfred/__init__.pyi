@@ -27,6 +27,8 @@ from .optimize.estimate import MapEstimate
 from .optimize.find_map import find_map, reject_outliers
 from .optimize.fit_psf import fit_psf
 from .optimize.follow import follow_images
+from .optimize.grid_marks import invert_dots
+from .optimize.grid_target import GridImage, GridTarget, index_grid
 from .optimize.measure_psf import marginalize_psf, measure_psf
 from .optimize.uncatalogued import UncataloguedSources, find_uncatalogued
 from .sampling.chain import Chain
@@ -52,6 +54,8 @@ __all__ = [
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",
+    "GridImage",
+    "GridTarget",
     "InputError",
     "LaplaceMove",
     "LogDistortion",
@@ -85,6 +89,8 @@ __all__ = [
     "find_uncatalogued",
     "fit_psf",
     "follow_images",
+    "index_grid",
+    "invert_dots",
     "laplace",
     "log_evidence",
     "marginalize_psf",

@@ -42,7 +42,7 @@ from bayesfred.sampling.progress import searching
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import sample
 from bayesfred.sections import toml
-from bayesfred.sources import find_sources
+from bayesfred.sources import bright, find_sources
 
 __all__ = [
     "Job",
@@ -116,8 +116,8 @@ def read_frame(
     notes: list[str] = []
 
     def note(*lines: str) -> None:
-        notes.extend(lines)
-        for line in lines:
+        for line in filter(None, lines):
+            notes.append(line)
             if say:
                 say(line)
 
@@ -128,15 +128,15 @@ def read_frame(
     )
     note(frame.description)
     noise, line = build.noise_given(run, frame.read_noise)
-    if line:
-        note(line)
+    note(line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = build.reference_psf(run, run_file)
     sources, lines = find_sources(run, run_file, shape, psf, frame)
     note(*lines)
+    counts, noise = bright(run, run_file, frame, noise)
     with naming(run_file):
         model = build.forward_model(run, shape, sources, psf)
-        posterior = build.posterior_given(run, model, frame.counts, frame.valid, noise)
+        posterior = build.posterior_given(run, model, counts, frame.valid, noise)
         estimate, rough = None, isinstance(psf, PSFToMeasure)
         if posterior.nuisances.footprint is not None:
             with searching() if say else nullcontext():

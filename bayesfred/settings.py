@@ -13,7 +13,7 @@ import json
 import tomllib
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
@@ -74,13 +74,36 @@ class FrameSettings(Section):
     reject_outliers: bool = False
 
 
+class TargetSettings(Section):
+    """`[catalogue.grid]`: a target that is indexed from the frame; `optimize.grid_target` does it.
+
+    Attributes
+    ----------
+    rows, columns : int
+        Of the target.
+    pitch : float, optional, recorded pixel
+        Distance between neighbours; found from the frame, and compared with this.
+    layout : {'square', 'hexagonal'}
+    marks : {'pinholes', 'dots'}
+        Bright on dark, or dark on bright.
+    """
+
+    rows: Annotated[int, Field(ge=3, le=10_000)]
+    columns: Annotated[int, Field(ge=3, le=10_000)]
+    pitch: Positive | None = None
+    layout: Literal["square", "hexagonal"] = "square"
+    marks: Literal["pinholes", "dots"] = "pinholes"
+
+
 class CatalogueSettings(Section):
     """`[catalogue]`: the known sources, by their positions on the object plane or on the sky.
 
     Attributes
     ----------
-    path : str
+    path : str, optional
         The catalogue's file.
+    grid : TargetSettings, optional
+        A target without a list of positions, in place of the file.
     x, y : str
         Columns of the positions, pixel from the middle of the frame.
     ra, dec : str, optional
@@ -99,7 +122,8 @@ class CatalogueSettings(Section):
         Magnitude of a source of one count; goes with `magnitude`.
     """
 
-    path: Name
+    path: Name | None = None
+    grid: TargetSettings | None = None
     x: Name = "x"
     y: Name = "y"
     ra: Name | None = None
@@ -115,6 +139,11 @@ class CatalogueSettings(Section):
     def _both_or_neither(self) -> CatalogueSettings:
         for pair in (("magnitude", "zero_point"), ("ra", "dec"), ("pm_ra", "pm_dec")):
             _together(self, *pair)
+        if (self.path is None) == (self.grid is None):
+            got = "neither path nor grid" if self.path is None else "path and grid"
+            raise ValueError(f"got {got}, expected one of them")
+        if self.grid is not None and self.model_fields_set - {"grid", "x", "y", "flux"}:
+            raise ValueError("got columns of a file, expected none with a grid")
         if self.ra is not None and (self.x, self.y) != ("x", "y"):
             raise ValueError("got x or y, expected them without ra and dec only")
         if self.ra is None and (self.pm_ra or self.epoch):

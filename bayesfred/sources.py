@@ -1,6 +1,7 @@
 """From `[catalogue]` and `[sky]` to the sources of a frame, in pixels from its middle.
 
-A catalogue has positions on the object plane, or directions on the sky. In the second case
+A catalogue has positions on the object plane, or directions on the sky; a target's grid is indexed
+from the frame. In the second case
 `[sky]` or the frame's header gives a guess of the pointing, which `optimize.pose` refines by the
 stars of the frame. A frame that is still to be simulated has none: there the guess is the truth.
 """
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesfred import settings
+from bayesfred._typing import Floats
 from bayesfred.errors import InputError, printable
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.psf import PSF
@@ -19,10 +21,13 @@ from bayesfred.io.catalogues import SkyRecord, read_catalogue, read_sky_catalogu
 from bayesfred.io.frames import FrameRecord
 from bayesfred.io.paths import resolve
 from bayesfred.io.tangent_plane import ARCSEC, Parity, TangentPlane
+from bayesfred.model.noise import GaussianNoise, Noise, PoissonNoise
+from bayesfred.optimize.grid_marks import invert_dots
+from bayesfred.optimize.grid_target import GridTarget, index_grid
 from bayesfred.optimize.peaks import bright_peaks, typical_flux
 from bayesfred.optimize.pose import find_pose
 
-__all__ = ["find_sources"]
+__all__ = ["bright", "find_sources"]
 
 # Share of the frame's half-width by which images may stand away from their sources: three standard
 # deviations of a term's default prior. Sources whose light is farther from the frame than that are
@@ -65,7 +70,10 @@ def find_sources(
     InputError
         If the catalogue cannot be used, or the frame's pose is not found.
     """
-    c, path = run.catalogue, resolve(run.catalogue.path, run_file, must_exist=True)
+    c = run.catalogue
+    if c.path is None:
+        return _target(run, run_file, psf, frame)
+    path = resolve(c.path, run_file, must_exist=True)
     free = frame is not None and run.nuisances.flux == "free"
     column = None if free and "flux" not in c.model_fields_set else c.flux
     binning = run.detector.binning
@@ -102,6 +110,66 @@ def find_sources(
         numbers += f"; without fluxes, which are free and begin at {flux[0]:.3g} counts"
     sources = SourceCatalog(x[kept], y[kept], flux[kept], sky)
     return sources, [*notes, f"{printable(path.name)}: {numbers}"]
+
+
+def _target(
+    run: settings.RunSettings, run_file: Path, psf: PSF, frame: FrameRecord | None
+) -> tuple[SourceCatalog, list[str]]:
+    """The marks of a target that the frame shows."""
+    grid, binning = run.catalogue.grid, run.detector.binning
+    if frame is None or grid is None:
+        raise InputError(
+            f"{run_file}: catalogue.grid: got a target to be indexed from a frame that is still to "
+            "be simulated, expected [simulation.grid] and catalogue.path"
+        )
+    if run.nuisances.flux != "free":
+        raise InputError(
+            f"{run_file}: nuisances.flux: got {run.nuisances.flux!r}, expected 'free' with "
+            "catalogue.grid, as the marks' fluxes are known roughly only"
+        )
+    target = GridTarget(grid.rows, grid.columns, grid.pitch, grid.layout, grid.marks)
+    width = math.hypot(psf.sigma / binning, 12.0**-0.5)
+    try:
+        found = index_grid(frame.counts, frame.valid, target, width)
+    except InputError as error:
+        raise InputError(f"{run_file}: catalogue.{error}") from None
+    flux = np.maximum(found.flux, 1.0)
+    sources = SourceCatalog(binning * found.x, binning * found.y, flux)
+    return sources, [f"grid: {found.message}"]
+
+
+def bright(
+    run: settings.RunSettings, run_file: Path, frame: FrameRecord, noise: Noise
+) -> tuple[Floats, Noise]:
+    """The counts to fit: as they are, or inverted for dark dots, with the noise of the frame.
+
+    Parameters
+    ----------
+    run : RunSettings
+    run_file : Path
+    frame : FrameRecord
+    noise : Noise
+        That of [noise].
+
+    Returns
+    -------
+    counts : ndarray, shape (ny, nx), counts
+    noise : Noise
+
+    Raises
+    ------
+    InputError
+        If dots are dark and [noise] names another noise than Poisson's.
+    """
+    if run.catalogue.grid is None or run.catalogue.grid.marks != "dots":
+        return frame.counts, noise
+    if not isinstance(noise, PoissonNoise):
+        raise InputError(
+            f"{run_file}: noise: got {type(noise).__name__} with marks = 'dots', expected the "
+            "default, whose read noise is used"
+        )
+    counts, variance = invert_dots(frame.counts, frame.valid)
+    return counts, GaussianNoise(variance + noise.read_noise**2)
 
 
 def _plane(

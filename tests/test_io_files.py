@@ -343,7 +343,7 @@ def test_frames_of_other_types(tmp_path: Path) -> None:
     assert "expected real" in message(write_frame, tmp_path / "new.npy", [["a"]])
 
 
-@pytest.mark.parametrize("name", ["frame.tif", "frame", "frame.gz", "frame.npy.gz", "frame.h5.fz"])
+@pytest.mark.parametrize("name", ["frame.jpg", "frame", "frame.gz", "frame.npy.gz", "frame.h5.fz"])
 def test_frame_suffixes_refused(tmp_path: Path, name: str) -> None:
     for call in (
         message(read_frame, tmp_path / name),

@@ -113,7 +113,8 @@ def test_example_names_every_key(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
     path.write_text(
         re.sub(
-            r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling|variance) = |path = \"psf)",
+            r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling|variance|rows|columns|pitch|layout|marks)"
+            r" = |path = \"psf|\[catalogue.grid)",
             "# ",
             text,
         )

@@ -100,7 +100,7 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     # written beside the run file, whatever lies in the data folder
     folder, grid = run_file.parent, simulation.grid is not None
     frame = paths.within(folder, run.frame.path, f"{run_file}: frame.path")
-    catalogue = paths.within(folder, run.catalogue.path, f"{run_file}: catalogue.path")
+    catalogue = paths.within(folder, run.catalogue.path or "", f"{run_file}: catalogue.path")
     paths.may_write(frame, overwrite=overwrite, beside=(catalogue,) if grid else ())
     if grid:
         s = posterior.model.sources

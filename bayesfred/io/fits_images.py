@@ -34,7 +34,7 @@ MOST_FLAGGED = 0.9  # share of the pixels
 
 
 class StoredImage(NamedTuple):
-    """The image in a file, with what the file says of its pixels; FITS files alone say anything.
+    """The image in a file, with what the file says of its pixels; FITS files alone say much.
 
     Attributes
     ----------
@@ -49,6 +49,8 @@ class StoredImage(NamedTuple):
         Where the header places the frame on the sky, in stored pixels.
     date : str or None
         When it was taken.
+    largest : float or None
+        The largest number of its type, for pictures.
     """
 
     stored: Floats
@@ -57,6 +59,7 @@ class StoredImage(NamedTuple):
     unused: tuple[str, ...] = ()
     sky: TangentPlane | None = None
     date: str | None = None
+    largest: float | None = None
 
 
 class _Stream(io.BufferedReader):

@@ -1,4 +1,4 @@
-"""Frames on disk: FITS, HDF5 and NPY images.
+"""Frames on disk: FITS, HDF5, NPY, TIFF and PNG images.
 
 :func:`read_frame` turns stored numbers into counts and says which pixels to trust. A frame comes in
 as a record that owns its arrays and knows nothing of the model. What a file gets wrong is said in
@@ -27,6 +27,7 @@ from bayesfred.io.atomic import replace
 from bayesfred.io.fits_images import StoredImage, read_fits
 from bayesfred.io.headers import conversion
 from bayesfred.io.paths import may_write
+from bayesfred.io.pictures import read_picture
 from bayesfred.io.reading import readable, require_file
 from bayesfred.io.saturation import plateau
 from bayesfred.io.tangent_plane import TangentPlane
@@ -46,6 +47,7 @@ _FORMATS = {
     ".h5": "HDF5",
     ".hdf5": "HDF5",
     ".npy": "NPY",
+    **dict.fromkeys((".png", ".tif", ".tiff"), "picture"),
 }
 
 # Up to this count float64 has every whole number.
@@ -101,8 +103,9 @@ def read_frame(
     Parameters
     ----------
     path : path-like
-        A FITS (.fits .fit .fts, also followed by .gz or .fz), HDF5 (.h5 .hdf5) or NumPy (.npy)
-        file.
+        A FITS (.fits .fit .fts, also followed by .gz or .fz), HDF5 (.h5 .hdf5), NumPy (.npy), TIFF
+        (.tif .tiff) or PNG (.png) file. Pictures have to hold linear grey values, and their
+        orientation is not applied.
     gain : float, optional, e-/adu
         Counts are (stored - pedestal) * gain. By default a FITS header's EGAIN or GAIN, or 1 where
         its BUNIT is electrons. Without a gain the stored numbers, less the pedestal, must be counts
@@ -161,7 +164,7 @@ def read_frame(
     masks |= {f"flagged in {flagging}": flags for flagging, flags in image.flags.items()}
     level, why = known.saturation, "saturated"
     if level is None:
-        level, why = plateau(stored[finite]), "suspected of saturation"
+        level, why = plateau(stored[finite], image.largest), "suspected of saturation"
         if level is not None:
             notes.append(
                 f"saturation suspected at the maximum of {level:.9g}: give a higher saturation if "
@@ -237,6 +240,11 @@ def write_frame(path: PathLike, counts: ArrayLike, *, overwrite: bool = False) -
     """
     path = Path(path)
     kind = _format(path)
+    if kind == "picture":
+        raise InputError(
+            f"{path}: got a picture to write, expected FITS, HDF5 or NPY, which hold every bit of "
+            "a count: change its suffix"
+        )
     image = np.asarray(counts)
     _require_image(path, image.shape, image.dtype)
     may_write(path, overwrite=overwrite)
@@ -345,10 +353,19 @@ def _read_npy(path: Path, name: str | None) -> StoredImage:
         return StoredImage(np.array(stored, dtype=np.float64))
 
 
+def _read_picture(path: Path, name: str | None) -> StoredImage:
+    if name is not None:
+        raise InputError(f"{path}: got name {name!r}, expected none, as a picture holds one image")
+    stored = read_picture(path, require_memory)
+    largest = None if stored.dtype.kind == "f" else float(np.iinfo(stored.dtype).max)
+    return StoredImage(stored.astype(np.float64), largest=largest)
+
+
 _READERS: dict[str, Callable[[Path, str | None], StoredImage]] = {
     "FITS": _read_fits,
     "HDF5": _read_hdf5,
     "NPY": _read_npy,
+    "picture": _read_picture,
 }
 
 

@@ -16,16 +16,19 @@ __all__ = ["plateau"]
 
 CHANCE = 1e-3  # of suspecting a frame without saturated pixels, at most
 TOP = 0.1  # share of the range, from the median to the maximum, that is compared with the maximum
-FULL_SCALE = (4095.0, 16383.0, 32767.0, 65535.0)  # of which one pixel is suspect
+# Of 12, 14, 15 and 16 bits, and of 12 and 14 bits in the upper ones of 16: one pixel is suspect.
+FULL_SCALE = (4095.0, 16383.0, 32767.0, 65535.0, 65520.0, 65532.0)
 SAMPLE = 10**5  # pixels in which the steps are looked for
 
 
-def plateau(stored: Floats) -> float | None:
+def plateau(stored: Floats, largest: float | None = None) -> float | None:
     """The level at which pixels look saturated; None where none do.
 
     Parameters
     ----------
     stored : ndarray, shape (n,), stored units; finite
+    largest : float, optional
+        The largest number that the file could hold: one pixel there is suspect.
 
     Returns
     -------
@@ -40,7 +43,7 @@ def plateau(stored: Floats) -> float | None:
     if not stored.size:
         return None
     top = float(stored.max())
-    if top in FULL_SCALE:
+    if top in FULL_SCALE or top == largest:
         return top
     with np.errstate(over="ignore"):
         steps = np.diff(np.unique(stored[:: max(1, stored.size // SAMPLE)]))
