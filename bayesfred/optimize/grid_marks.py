@@ -41,7 +41,7 @@ def invert_dots(counts: Floats, valid: Flags) -> tuple[Floats, Floats]:
     Returns
     -------
     inverted : ndarray, shape (ny, nx), counts
-        A level less the counts; positive but for one pixel in a thousand.
+        Twice the level that one pixel in a thousand exceeds, less the counts.
     variance : ndarray, shape (ny, nx), counts^2
         Of `bayesfred.GaussianNoise`; read noise has to be added. At least 1.
 
@@ -54,11 +54,12 @@ def invert_dots(counts: Floats, valid: Flags) -> tuple[Floats, Floats]:
     --------
     >>> inverted, variance = invert_dots(np.full((9, 9), 100.0), np.ones((9, 9), dtype=bool))
     >>> float(inverted[4, 4]), round(variance[4, 4])
-    (0.0, 100)
+    (100.0, 100)
     """
     if not valid.any():
         raise InputError("valid: got no valid pixel, expected some to use")
-    level = float(np.ceil(np.percentile(counts[valid], 99.9)))
+    # twice the brightest: the background of what is inverted stays well above zero
+    level = float(np.ceil(2.0 * np.percentile(counts[valid], 99.9)))
     filled = _filled(counts, valid, 1.0)
     y, x = np.mgrid[-2:3, -2:3].reshape(2, -1)
     others = (x != 0) | (y != 0)

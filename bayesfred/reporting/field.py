@@ -72,12 +72,12 @@ def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -
         shading="gouraud" if np.isfinite(length).all() else "nearest", rasterized=True,
     )  # fmt: skip
     fig.colorbar(image, ax=ax, label=f"displacement / {unit}", shrink=0.8)
-    _hatch(ax, points.u, points.v, points.hull)
+    hatch(ax, points.hull)
     some = (slice(None, None, 2), slice(None, None, 2))
     shown = np.isfinite(length[some])
     at = np.stack([points.u[some][shown], points.v[some][shown]], axis=1)
     spacing = 2.0 * _spacing(field)
-    arrows = _arrows(ax, at, mean[some][shown], 1.2 * spacing, unit)
+    scale = arrows(ax, at, mean[some][shown], 1.2 * spacing, unit)
     values, vectors = np.linalg.eigh(field.covariance[some][shown])
     axes = np.sqrt(np.maximum(values, 0.0))  # along the columns of `vectors`, the larger last
     among = (points.weights[some] > 0.0)[shown]
@@ -93,7 +93,7 @@ def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -
             )
         )  # fmt: skip
     ax.set_title(
-        f"displacement{arrows}\nellipses (1 sd) {_times(enlarged)}",
+        f"displacement{scale}\nellipses (1 sd) {_times(enlarged)}",
         loc="left", fontsize=11,
     )  # fmt: skip
 
@@ -113,17 +113,17 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
     # a faint source's arrow, which is noise, would make those of the others too small to be seen
     short = length <= 3.0 * np.quantile(length, 0.95) if len(at) else np.zeros(0, dtype=bool)
     colours = np.where(far, TRUTH_COLOUR, POSTERIOR_COLOUR)[short]
-    arrows = _arrows(ax, at[short], off[short], 3.0 * _spacing(field), unit, colours)
+    scale = arrows(ax, at[short], off[short], 3.0 * _spacing(field), unit, colours)
     by_chance = len(at) * math.exp(-0.5 * SIGNIFICANT**2)  # of normal errors along two axes
     ax.plot(*at[far & ~short].T, "x", color=TRUTH_COLOUR)
     ax.set_title(
-        f"sources, off the model{arrows}\n{far.sum()} of {len(at)} by more than "
+        f"sources, off the model{scale}\n{far.sum()} of {len(at)} by more than "
         f"{SIGNIFICANT:.0f} sd (orange), {by_chance:.0f} by chance",
         loc="left", fontsize=11,
     )  # fmt: skip
 
 
-def _arrows(
+def arrows(
     ax: Axes, at: Floats, vectors: Floats, longest: float, unit: str, colours: Strings | str = "k"
 ) -> str:
     """Arrows of which the longest has this length on the axes, and one of known length below.
@@ -155,15 +155,15 @@ def _times(enlarged: float) -> str:
     return "to scale" if enlarged == 1.0 else f"{enlarged:,.10g} times enlarged"
 
 
-def _hatch(ax: Axes, u: Floats, v: Floats, hull: Floats) -> None:
-    """Hatch the frame outside the hull of the sources' images."""
-    low_u, high_u, low_v, high_v = u.min(), u.max(), v.min(), v.max()
+def hatch(ax: Axes, hull: Floats) -> None:
+    """Hatch what the axes show outside the hull of the sources' images."""
+    (low_u, high_u), (low_v, high_v) = ax.get_xlim(), ax.get_ylim()
     frame = [(low_u, low_v), (high_u, low_v), (high_u, high_v), (low_u, high_v)]
     rings = [frame, hull[::-1].tolist()] if len(hull) else [frame]
     paths = [Path([*ring, ring[0]], closed=True) for ring in rings]
     patch = PathPatch(
         Path.make_compound_path(*paths), facecolor="none", edgecolor=EXTRAPOLATED, hatch="///",
-        linewidth=0.8, alpha=0.5,
+        linewidth=0.8, alpha=0.5, zorder=2,
     )  # fmt: skip
     ax.add_patch(patch)
 

@@ -262,7 +262,9 @@ def _nested(
             mean, given = params.copy(), np.zeros(covariance.shape)
             mean[j] *= np.exp(k * ratio)
             given[np.ix_(rest, rest)] = inverse(posterior.information(mean)[np.ix_(rest, rest)])
-            mean += given @ posterior.gradient(mean)
+            moved = np.clip(mean + given @ posterior.gradient(mean), *posterior.support)
+            if np.isfinite(posterior.log_prob(moved)):  # at a bound there may be no density
+                mean = moved
             given[j, j] = (ratio * mean[j] * width) ** 2
             log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(given)[1]
             if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
