@@ -4,25 +4,31 @@ A chain holds a frame, its draws and everything needed to replay them. A `Calibr
 others need to use them: the distortion, the mean, covariance and draws of its coefficients, the
 detector, the PSF and where the object plane is on the sky. `positions` does the
 computing, `maps` evaluates a calibration over the field, `difference` compares two of one camera,
-`exports` writes it for other tools, and `correct` resamples frames with it.
+`wcs`, `generalized_wcs`, `opencv` and `regions` write it for other tools, and `correct` resamples
+frames with it.
 """
 
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from astropy import units
 from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
 
 from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.field import hull_of, images_of, inside_hull
 from bayesfred.calibration.difference import CalibrationDifference, difference
+from bayesfred.calibration.generalized_wcs import generalized_wcs
 from bayesfred.calibration.maps import DisplacementMap, PSFMap, displacement_map, psf_map
+from bayesfred.calibration.opencv import opencv_camera
+from bayesfred.calibration.plate import known_sky
 from bayesfred.calibration.positions import Method, Positions, broadcast_points
+from bayesfred.calibration.wcs import sip
 from bayesfred.errors import ExtrapolationWarning, InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -47,7 +53,8 @@ class Calibration:
 
     Points of both planes are in pixels of the fine grid from the middle of the frame: u and x along
     columns, v and y along rows. The array index of a recorded pixel is u / binning + (columns - 1)
-    / 2; `index` and `from_index` convert.
+    / 2; `index` and `from_index` convert. Points beyond the sources, where only the terms of the
+    distortion say what happens, are warned of: `ExtrapolationWarning`.
 
     Parameters
     ----------
@@ -206,11 +213,6 @@ class Calibration:
             NaN where no image is found.
         covariance : ndarray, shape (..., 2, 2), pixel^2
             Of the calibration alone, not of the object's position.
-
-        Warns
-        -----
-        ExtrapolationWarning
-            Some of the points are beyond the sources.
         """
         found = self.positions.image(*broadcast_points(x, y), method)
         self._warn(*found[:2])
@@ -234,11 +236,6 @@ class Calibration:
             NaN where no object is imaged.
         covariance : ndarray, shape (..., 2, 2), pixel^2
             Of the calibration alone, not of a measured (u, v).
-
-        Warns
-        -----
-        ExtrapolationWarning
-            Some of the points are beyond the sources.
         """
         u, v = broadcast_points(u, v)
         self._warn(u, v)
@@ -266,14 +263,9 @@ class Calibration:
         Raises
         ------
         InputError
-            If it is not known where the object plane is on the sky.
-
-        Warns
-        -----
-        ExtrapolationWarning
-            Some of the points are beyond the sources.
+            If the object plane has no place on the sky.
         """
-        sky = self._known_sky()
+        sky = known_sky(self)
         u, v = broadcast_points(u, v)
         self._warn(u, v)
         x, y, covariance = self.positions.object(u, v, method)
@@ -301,14 +293,9 @@ class Calibration:
         Raises
         ------
         InputError
-            If it is not known where the object plane is on the sky.
-
-        Warns
-        -----
-        ExtrapolationWarning
-            Some of the images are beyond the sources.
+            If the object plane has no place on the sky.
         """
-        found = self.positions.image(*self._known_sky().to_plane(*icrs(coordinates)), method)
+        found = self.positions.image(*known_sky(self).to_plane(*icrs(coordinates)), method)
         self._warn(*found[:2])
         return found
 
@@ -326,30 +313,46 @@ class Calibration:
         return (u - 0.5 * (nx - 1)) * binning, (v - 0.5 * (ny - 1)) * binning
 
     def displacement_map(self, step: float) -> DisplacementMap:
-        """The displacement and its covariance on a grid over the frame.
-
-        Parameters
-        ----------
-        step : float, pixel of the fine grid
-
-        Returns
-        -------
-        DisplacementMap
-        """
+        """The displacement and its covariance, every `step` pixels of the fine grid."""
         return displacement_map(self, step)
 
     def psf_map(self, step: float) -> PSFMap:
-        """Size and ellipticity of the images of point sources on a grid over the frame.
+        """Size and ellipticity of images, every `step` pixels of the fine grid."""
+        return psf_map(self, step)
+
+    def to_wcs(self, sip_degree: int = 3) -> WCS:
+        """The calibration as a TAN-SIP coordinate system, see `wcs.sip`.
 
         Parameters
         ----------
-        step : float, pixel of the fine grid
+        sip_degree : int
+            2 to 9.
 
         Returns
         -------
-        PSFMap
+        astropy.wcs.WCS
+            Of array indices; `wcs.sip` has its truncation error and its draws too.
         """
-        return psf_map(self, step)
+        return sip(self, sip_degree).wcs
+
+    def to_gwcs(self, degree: int = 3) -> Any:
+        """The calibration as a `gwcs.WCS`, see `generalized_wcs`; needs the package gwcs."""
+        return generalized_wcs(self, degree).wcs
+
+    def to_opencv(self, *, focal_length: float | None = None) -> dict[str, Any]:
+        """The calibration as OpenCV's camera, see `opencv.opencv_camera`.
+
+        Parameters
+        ----------
+        focal_length : float, optional, recorded pixel
+            Needed where the object plane has no place on the sky.
+
+        Returns
+        -------
+        dict
+            Camera matrix, distortion coefficients, rotation, truncation error and draws.
+        """
+        return opencv_camera(self, focal_length=focal_length)
 
     def difference(self, other: "Calibration") -> CalibrationDifference:
         """Whether the camera has changed between two calibrations.
@@ -375,14 +378,6 @@ class Calibration:
     def inside(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Flags:
         """Whether image points lie within the convex hull of the sources' images."""
         return inside_hull(hull_of(self.sources), *broadcast_points(u, v))
-
-    def _known_sky(self) -> TangentPlane:
-        if self.sky is None:
-            raise InputError(
-                "sky: got a calibration whose object plane has no place on the sky, expected one "
-                "of a catalogue with ra and dec"
-            )
-        return self.sky
 
     def _warn(self, u: Floats, v: Floats) -> None:
         """Say how many points are beyond the sources."""
