@@ -13,6 +13,8 @@ from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.prior_predictive import PriorPredictive, prior_predictive
 from .analysis.sbc import SBCResult, simulation_based_calibration
 from .calibration.calibration import Calibration
+from .calibration.correct import correct
+from .calibration.corrected import CorrectedFrame
 from .errors import ExtrapolationWarning, InputError
 from .imaging.catalog import SourceCatalog
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
@@ -44,6 +46,7 @@ __all__ = [
     "Cause",
     "Chain",
     "Comparison",
+    "CorrectedFrame",
     "CrossCheck",
     "Design",
     "Detector",
@@ -79,6 +82,7 @@ __all__ = [
     "choose_terms",
     "commands",
     "compare",
+    "correct",
     "correct_sampling",
     "cross_check",
     "design",

@@ -241,6 +241,99 @@ def crosscheck(
 
 
 @app.command()
+def calibration(
+    chain_file: ChainFile,
+    *,
+    sip: Annotated[
+        int | None, typer.Option(metavar="DEGREE", help="A FITS header, TAN-SIP of degree 2 to 9.")
+    ] = None,
+    tpv: Annotated[
+        int | None, typer.Option(metavar="DEGREE", help="A FITS header, TPV of degree 1 to 7.")
+    ] = None,
+    gwcs: Annotated[
+        int | None, typer.Option(metavar="DEGREE", help="A gwcs in ASDF, of degree 2 to 9.")
+    ] = None,
+    opencv: Annotated[bool, typer.Option("--opencv", help="OpenCV's camera, JSON.")] = False,
+    focal_length: Annotated[
+        float | None,
+        typer.Option(help="For OpenCV, recorded pixels.", show_default="from the sky"),
+    ] = None,
+    regions: Annotated[
+        bool, typer.Option("--regions", help="Residuals of the sources, for DS9.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="The file.", show_default="beside the chain"),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Hand a calibration over: positions with errors, maps and a picture, or another tool's format.
+
+    Exit code 3 says that the fit cannot be trusted; the files are written nevertheless.
+    """
+    degrees = {"sip": sip, "tpv": tpv, "gwcs": gwcs}
+    forms = [form for form, degree in degrees.items() if degree is not None]
+    forms += ["opencv"] * opencv + ["regions"] * regions
+
+    def work() -> bool:
+        if len(forms) > 1:
+            raise InputError(f"got --{' and --'.join(forms)}, expected one format a call")
+        form = forms[0] if forms else None
+        return bf.show.show_calibration(
+            bf.commands.calibration(
+                chain_file,
+                form=form,
+                degree=degrees.get(form or "") or 3,
+                focal_length=focal_length,
+                out=out,
+                overwrite=overwrite,
+            )
+        )
+
+    _run(work)
+
+
+@app.command()
+def correct(
+    frame: Annotated[Path, typer.Argument(metavar="FRAME", help="A frame.", show_default=False)],
+    calibration_file: Annotated[
+        Path, typer.Argument(metavar="CALIBRATION.h5", help="A calibration.", show_default=False)
+    ],
+    *,
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE.fits", help="The frame to write.", show_default=False),
+    ],
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            "--like",
+            metavar="OTHER.fits",
+            help="Use the pixels of this image.",
+            show_default="the object plane",
+        ),
+    ] = None,
+    gain: Annotated[float | None, typer.Option(help="e-/adu", show_default="the header's")] = None,
+    pedestal: Annotated[float | None, typer.Option(help="Stored units.", show_default="0")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Resample a frame to undistorted coordinates: counts, errors, mask, WCS."""
+    _run(
+        lambda: bf.show.show_corrected(
+            bf.commands.correct(
+                frame,
+                calibration_file,
+                out=out,
+                like=like,
+                gain=gain,
+                pedestal=pedestal,
+                overwrite=overwrite,
+            )
+        )
+    )
+
+
+@app.command()
 def verify(
     chain_file: ChainFile,
     every_draw: Annotated[

@@ -11,11 +11,13 @@ from bayesfred.analysis.field import DisplacementField
 from bayesfred.analysis.noise_study import NoiseStudy
 from bayesfred.analysis.photons import PhotonsNeeded
 from bayesfred.analysis.sbc import SBCResult
+from bayesfred.calibration.calibration import Calibration
+from bayesfred.calibration.corrected import CorrectedFrame
 from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
 
-__all__ = ["Compared", "Planned", "Result", "Simulated", "Study"]
+__all__ = ["Calibrated", "Compared", "Corrected", "Planned", "Result", "Simulated", "Study"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,3 +127,38 @@ class Compared:
     ranking: Comparison | None
     reason: str
     page: Path | None
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A calibration and its files.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    files : dict of str to Path
+        What each file is, and where.
+    lines : tuple of str
+        What is to be known of the files: errors of the export, in recorded pixels.
+    """
+
+    calibration: Calibration
+    files: dict[str, Path]
+    lines: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A corrected frame and its file.
+
+    Attributes
+    ----------
+    frame : CorrectedFrame
+    description : str
+        What was read, in one line.
+    path : Path
+    """
+
+    frame: CorrectedFrame
+    description: str
+    path: Path

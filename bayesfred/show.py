@@ -17,7 +17,7 @@ from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
 from bayesfred.proposal import Proposed
-from bayesfred.records import Compared, Planned, Result, Simulated, Study
+from bayesfred.records import Calibrated, Compared, Corrected, Planned, Result, Simulated, Study
 from bayesfred.reporting import screen
 
 
@@ -109,6 +109,23 @@ def show_proposal(proposed: Proposed) -> bool:
     return True
 
 
+def show_calibration(done: Calibrated) -> bool:
+    """Print where a calibration is, by how much exports differ from it, and whether to trust it."""
+    _print_files(**done.files)
+    for line in done.lines:
+        print(line)
+    print(done.calibration.message)
+    return done.calibration.trustworthy
+
+
+def show_corrected(done: Corrected) -> bool:
+    """Print what was read and what was written."""
+    print(done.description)
+    _print_files(frame=done.path)
+    print(done.frame.message)
+    return True
+
+
 def show_design(planned: Planned) -> bool:
     """Print what a planned frame would tell."""
     _print_files(table=planned.table, picture=planned.picture)
@@ -177,5 +194,6 @@ def _console() -> Console:
 
 
 def _print_files(**named: Path) -> None:
+    width = max(8, *(len(label) + 1 for label in named))
     for label, path in named.items():
-        print(f"{label:8}{printable(str(path))}")
+        print(f"{label:{width}}{printable(str(path))}")

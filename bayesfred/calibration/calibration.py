@@ -71,7 +71,9 @@ class Calibration:
     sky : TangentPlane, optional
         Where the object plane is on the sky.
     title, message : str
-        What was calibrated, and whether the fit can be trusted.
+        What was calibrated, and what was said of the fit.
+    trustworthy : bool
+        Whether the fit can be trusted.
 
     Raises
     ------
@@ -100,6 +102,7 @@ class Calibration:
     sky: TangentPlane | None = None
     title: str = ""
     message: str = ""
+    trustworthy: bool = True
 
     def __post_init__(self) -> None:
         for name in ("draws", "sources"):
@@ -141,6 +144,7 @@ class Calibration:
         psf, names = posterior.model.psf, chain.parameter_names
         free = "psf_sigma" in names
         width = float(draws[:, names.index("psf_sigma")].mean()) if free else psf.sigma
+        diagnostics = diagnose(chain, target_ess=chain.target_ess)
         return cls(
             posterior.model.polynomial,
             np.hstack([theta, offset]),
@@ -150,7 +154,8 @@ class Calibration:
             images_of(posterior, chain.estimate.params),
             posterior.model.sources.sky,
             chain.record.title if chain.record else "",
-            diagnose(chain, target_ess=chain.target_ess).message,
+            diagnostics.message,
+            diagnostics.trustworthy,
         )
 
     @classmethod

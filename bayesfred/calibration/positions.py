@@ -51,6 +51,16 @@ class Positions:
         """Their covariance, shape (n_terms + 2, n_terms + 2)."""
         return np.atleast_2d(np.cov(self.draws, rowvar=False))
 
+    @cached_property
+    def root(self) -> Floats:
+        """A triangular matrix R with covariance = R R^T.
+
+        It is taken from the draws, so that coefficients of high powers, which are many orders of
+        magnitude smaller than others, keep their digits.
+        """
+        triangle = np.linalg.qr(self.draws - self.mean).R
+        return np.asarray(triangle.T / np.sqrt(len(self.draws) - 1.0))
+
     def image(
         self, x: Floats, y: Floats, method: Method = "delta"
     ) -> tuple[Floats, Floats, Floats]:
@@ -122,8 +132,7 @@ class Positions:
 
     def _delta(self, at: tuple[Floats, Floats, Floats, Floats], *, images: bool) -> Floats:
         """The covariance to first order at points u, v, x, y, shape (..., 2, 2)."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))  # C = root root^T
+        root = self.root
         u, v, x, y = (np.ravel(p) for p in at)
         out = np.empty((u.size, 2, 2))
         for first in range(0, u.size, BLOCK):
