@@ -287,6 +287,7 @@ def calibration(
                 focal_length=focal_length,
                 out=out,
                 overwrite=overwrite,
+                say=print,
             )
         )
 

@@ -174,6 +174,19 @@ def growth(
     return rows
 
 
+def calibration() -> Callable[[], object]:
+    """Objects of a million points with their covariance, for a lens of 18 terms."""
+    lens, rng = bf.PolynomialDistortion.polynomial(3), np.random.default_rng(1)
+    reach = lens.largest_displacement(512.0, 512.0).max(axis=0)
+    draws = np.hstack([rng.normal(size=(1000, lens.n_terms)) / reach, np.zeros((1000, 2))])
+    corners = np.array([[-512.0, -512.0], [512.0, -512.0], [512.0, 512.0], [-512.0, 512.0]])
+    known = bf.Calibration(
+        lens, draws, bf.Detector((1024, 1024)), bf.GaussianPSF(1.0), 1.0, corners
+    )
+    u, v = rng.uniform(-500.0, 500.0, (2, 10**6))
+    return lambda: known.to_object(u, v)
+
+
 def main() -> int:
     m = model()
     posterior = bf.Posterior(m, bf.simulate(m, THETA, 5.0, seed=1))
@@ -278,6 +291,11 @@ def main() -> int:
             3.0,
         ),
         ("saving / sampling, 150 steps", saving, 0.01),
+        (
+            "objects of 1,000,000 points with covariance / np.exp",
+            ratio(with_threads(1, calibration()), one, 3),
+            400.0,
+        ),
         (
             "twice the sources",
             ratio(lambda: twice.expected_counts(plain), lambda: once.expected_counts(plain), 20),

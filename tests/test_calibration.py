@@ -92,6 +92,25 @@ def test_covariance_is_that_of_finite_differences() -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-12)
 
 
+def test_high_powers_keep_their_digits() -> None:
+    """A polynomial of degree 5 on a large frame: coefficients from 1e-3 to 1e-16."""
+    lens = bf.PolynomialDistortion.polynomial(5)
+    reach = lens.largest_displacement(1000.0, 1000.0).max(axis=0)
+    rng = np.random.default_rng(8)
+    draws = np.hstack([rng.normal(size=(500, lens.n_terms)) / reach * 1e-3, np.zeros((500, 2))])
+    one = replace(calibration(), distortion=lens, draws=draws, detector=bf.Detector((2001, 2001)))
+    u, v = 20.0 * points(30)[0], 20.0 * points(30)[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", bf.ExtrapolationWarning)
+        delta, each = (one.to_object(u, v, method=m)[2] for m in ("delta", "draws"))  # type: ignore[arg-type]
+    np.testing.assert_allclose(delta, each, rtol=0.01, atol=0.01 * np.abs(each).max())
+    # the covariance itself has lost them: this is what is not done
+    values, vectors = np.linalg.eigh(one.positions.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    design = lens.design_matrix(u, v, u, v)[0] @ root[:-2] - root[-2]
+    assert np.abs(np.sum(design**2, axis=1) / each[:, 0, 0] - 1.0).max() > 0.1
+
+
 def test_sky_covariance_is_along_east_and_north() -> None:
     one, (u, v) = calibration(), points(10)
     _, covariance = one.to_sky(u, v)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from astropy.table import Table
+from scipy.spatial import cKDTree
 
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
@@ -13,6 +16,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.io.frames import read_frame
 from bayesfred.model.noise import GaussianNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
@@ -426,3 +430,20 @@ def test_dots_with_masked_pixels() -> None:
     assert np.mean(inverted[valid] < 0.0) < 0.002
     assert variance[valid].max() < 2.0 * field.max()
     assert variance.min() >= 1.0
+
+
+def test_a_real_mask_is_indexed() -> None:
+    """Pinholes of a defocused spectrograph: every index against the README's list of them."""
+    folder = Path(__file__).parents[2] / "shared" / "data"
+    if not (folder / "vimos_pinholes_q2.fits").exists():
+        pytest.skip("needs the frame of the pinhole mask")
+    frame = read_frame(folder / "vimos_pinholes_q2.fits", gain=15.0)
+    found = index_grid(frame.counts, frame.valid, GridTarget(48, 43), 1.8)
+    listed = Table.read(folder / "vimos_pinholes_q2_centroids.csv")
+    tree = cKDTree(np.stack([found.u, found.v], axis=1))
+    distance, nearest = tree.query(np.stack([listed["u"], listed["v"]], axis=1))
+    same = distance < 1.5
+    assert same.sum() > 1900
+    assert np.median(distance[same]) < 0.15
+    assert np.array_equal(found.column[nearest[same]], np.asarray(listed["i"])[same])
+    assert np.array_equal(found.row[nearest[same]], np.asarray(listed["j"])[same])

@@ -1,6 +1,7 @@
 """Commands that hand a calibration over, and use it."""
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ from bayesfred.calibration.wcs import sip, tpv
 from bayesfred.errors import InputError
 from bayesfred.io import atomic, paths
 from bayesfred.io.frames import read_frame
+from bayesfred.pipeline import Say
 from bayesfred.records import Calibrated, Corrected
 from bayesfred.reporting.calibration import STEPS, calibration_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
+from bayesfred.sampling.progress import searching
 
 __all__ = ["FORMATS", "calibration", "correct"]
 
@@ -44,6 +47,7 @@ def calibration(
     focal_length: float | None = None,
     out: PathLike | None = None,
     overwrite: bool = False,
+    say: Say | None = None,
 ) -> Calibrated:
     """Write the calibration of a chain, with maps and a picture; or in the format of another tool.
 
@@ -60,6 +64,8 @@ def calibration(
         The file; by default beside the chain, and maps and picture beside it.
     overwrite : bool
         Replace what is there.
+    say : callable, optional
+        Without it no progress is shown.
 
     Returns
     -------
@@ -82,7 +88,8 @@ def calibration(
     maps, picture = (path.with_suffix(s) for s in (".fits", ".png"))
     paths.may_write(path, overwrite=overwrite, beside=() if form else (maps, picture))
     chain = open_chain(chain_file)
-    known = Calibration.from_chain(chain)
+    with searching("judging the fit") if say else nullcontext():
+        known = Calibration.from_chain(chain)
     if form is None:
         step = max(known.detector.fine_shape) / STEPS
         known.write(path, overwrite=overwrite)
