@@ -294,7 +294,7 @@ def main() -> int:
         (
             "objects of 1,000,000 points with covariance / np.exp",
             ratio(with_threads(1, calibration()), one, 3),
-            400.0,
+            1200.0,
         ),
         (
             "twice the sources",

@@ -9,22 +9,48 @@ to them, and A and D the matrices of `imaging/inverse`. The draws give the same 
 approximation, for few points.
 """
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.inverse import slopes
+from bayesfred.imaging.monomials import Exponents
 
 __all__ = ["Method", "Positions", "broadcast_points"]
 
 Method = Literal["delta", "draws"]
 BLOCK = 2**13  # points whose covariances are computed at once: what fits the caches
+
+
+class _Powers:
+    """Powers of u, v, x and y at points, each computed once; of shape (points,)."""
+
+    def __init__(self, u: Floats, v: Floats, x: Floats, y: Floats) -> None:
+        self._of: list[list[Floats]] = [[np.ones_like(p), p] for p in (x, y, u, v)]
+
+    def sums(self, terms: Sequence[Exponents], coefficients: Floats) -> Floats:
+        """Sums of monomials with coefficients, shape (k, n_terms); shape (k, points)."""
+        if not terms:
+            return np.zeros((len(coefficients), self._of[0][0].size))
+        return np.asarray(coefficients @ np.array([self._monomial(term) for term in terms]))
+
+    def _monomial(self, term: Exponents) -> Floats:
+        out = None
+        for powers, exponent in zip(self._of, term, strict=True):
+            while len(powers) <= exponent:
+                powers.append(powers[-1] * powers[1])
+            if exponent:
+                out = powers[exponent] if out is None else out * powers[exponent]
+        return self._of[0][0] if out is None else out
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +104,9 @@ class Positions:
         """
         if method == "draws":
             return self._of_draws(x, y, images=True)
-        u, v = self.distortion.image_position(self.mean[:-2], x, y, offset=self.mean[-2:])
-        return u, v, self._delta((u, v, x, y), images=True)
+        with _threads(x.size):
+            u, v = self.distortion.image_position(self.mean[:-2], x, y, offset=self.mean[-2:])
+            return u, v, self._delta((u, v, x, y), images=True)
 
     def object(
         self, u: Floats, v: Floats, method: Method = "delta"
@@ -98,8 +125,9 @@ class Positions:
         """
         if method == "draws":
             return self._of_draws(u, v, images=False)
-        x, y = self.distortion.object_position(self.mean[:-2], u, v, offset=self.mean[-2:])
-        return x, y, self._delta((u, v, x, y), images=False)
+        with _threads(u.size):
+            x, y = self.distortion.object_position(self.mean[:-2], u, v, offset=self.mean[-2:])
+            return x, y, self._delta((u, v, x, y), images=False)
 
     def slope(self, at: tuple[Floats, Floats, Floats, Floats], *, images: bool = True) -> Floats:
         """The matrix D of images, or A of objects.
@@ -132,23 +160,32 @@ class Positions:
 
     def _delta(self, at: tuple[Floats, Floats, Floats, Floats], *, images: bool) -> Floats:
         """The covariance to first order at points u, v, x, y, shape (..., 2, 2)."""
-        root = self.root
+        split, root = len(self.distortion.f_terms), self.root
+        basis = self.distortion.basis
+        terms = root[:-2] if basis is None else basis @ root[:-2]  # of the monomials
         u, v, x, y = (np.ravel(p) for p in at)
         out = np.empty((u.size, 2, 2))
         for first in range(0, u.size, BLOCK):
             some = slice(first, first + BLOCK)
             part = u[some], v[some], x[some], y[some]
-            design = self.distortion.design_matrix(*part)
-            a, b = (design[k] @ root[:-2] - root[-2 + k] for k in (0, 1))
-            sums = [[np.sum(p * q, axis=1) for q in (a, b)] for p in (a, b)]
+            powers = _Powers(*part)
+            a = powers.sums(self.distortion.f_terms, terms[:split].T) - root[-2, :, None]
+            b = powers.sums(self.distortion.g_terms, terms[split:].T) - root[-1, :, None]
+            left, cross, right = (np.einsum("kp,kp->p", p, q) for p, q in ((a, a), (a, b), (b, b)))
             m = self.slope(part, images=images)
             inverse = np.empty_like(m)  # of many small matrices at once
             inverse[:, 0, 0], inverse[:, 1, 1] = m[:, 1, 1], m[:, 0, 0]
             inverse[:, 0, 1], inverse[:, 1, 0] = -m[:, 0, 1], -m[:, 1, 0]
             determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
             inverse /= determinant[:, None, None]
-            out[some] = inverse @ np.moveaxis(np.array(sums), 2, 0) @ inverse.swapaxes(1, 2)
+            middle = np.moveaxis(np.array([[left, cross], [cross, right]]), 2, 0)
+            out[some] = inverse @ middle @ inverse.swapaxes(1, 2)
         return out.reshape(*at[0].shape, 2, 2)
+
+
+def _threads(size: int) -> AbstractContextManager[object]:
+    """One thread for the small matrix products of many blocks; setting that takes a millisecond."""
+    return threadpool_limits(1, user_api="blas") if size > BLOCK else nullcontext()
 
 
 def broadcast_points(p: npt.ArrayLike, q: npt.ArrayLike) -> tuple[Floats, Floats]:
