@@ -22,6 +22,7 @@ from bayesfred.model.protocol import TargetDensity
 # maximum by 5e-8; sums over frames round at 1e-9.
 CLOSE_ENOUGH = 3e-4
 NEAR = 0.1  # the same where the number of steps is limited
+UNNOTICED = 1e-3  # of a log-posterior: a fall that is no reason to stop close to the maximum
 MOST_EVALUATIONS = 300  # after which no more searches begin
 
 # A Newton step is followed by another if it gains what it predicts to within this part.
@@ -107,6 +108,11 @@ def maximize(
             there = np.clip(params + fraction * newton.step, low, high)
             gain = float(posterior.log_prob(there)) - value
             evaluations += 1
+            if newton.distance < NEAR and -UNNOTICED < gain <= 0.0:
+                # the gradient's root is the maximum: for a model error it is that of log_prob to
+                # some hundredths of a standard deviation only
+                params, value, gain = there, value + gain, newton.predicted
+                break
             if 0.0 < gain < np.inf:
                 params, value = there, value + gain
                 break
