@@ -123,16 +123,15 @@ def test_two_hyperparameters_are_refused() -> None:
         bf.sample(Nested(), top(Nested()), seed=1, progress=False)
 
 
-@pytest.mark.parametrize(("slope", "found"), [(0.02, True), (0.5, False)])
-def test_a_gradient_that_is_nearly_right(slope: float, found: bool) -> None:
-    """Its root is the maximum if it is off by hundredths of a standard deviation, not by half."""
+def test_a_gradient_that_is_nearly_right() -> None:
+    """Its root is the maximum if log_prob differs by hundredths of a standard deviation."""
 
     class Tilted(CutGaussian):
         def log_prob(self, params: ArrayLike) -> Floats:
             x = np.asarray(params)
-            return np.asarray(super().log_prob(x) + slope * (x[..., 0] - MEAN[0]) / SD[0])
+            return np.asarray(super().log_prob(x) + 0.02 * (x[..., 0] - MEAN[0]) / SD[0])
 
-    result = maximize(Tilted(), np.append(MEAN + [0.01 * SD[0], 0.0], 0.0))
-    assert (result.distance < 1e-3) == found
-    if found:
-        assert np.abs(result.params[:2] - MEAN).max() < 1e-3 * SD.max()
+    near = np.array([MEAN[0] + 0.01 * SD[0], MEAN[1], 0.0])
+    result = maximize(Tilted(), near)
+    assert result.distance < 1e-3
+    assert np.abs((result.params[:2] - MEAN) / SD).max() < 1e-3
