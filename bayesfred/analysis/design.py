@@ -21,13 +21,17 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.analysis.field import FieldPoints, field_points, pixel_unit
+from bayesfred.analysis.field import (
+    FieldPoints,
+    displacement_derivatives,
+    field_points,
+    pixel_unit,
+)
 from bayesfred.analysis.optimal import Criterion, Information, greedy, search
 from bayesfred.analysis.photons import PhotonsNeeded, photons_needed
 from bayesfred.analysis.planned import (
     by_pointing,
     by_source,
-    derivatives,
     of_field,
     planned,
     selected,
@@ -235,7 +239,7 @@ def design(
         told = plan.fisher(params) + prior
         _require_known(plan, told)
         points = field_points(plan, params)
-        slopes = derivatives(plan, params, points.u, points.v)
+        slopes = displacement_derivatives(plan, params, points.u, points.v)
         sd = np.sqrt(0.5 * np.einsum("rcik,kl,rcil->rc", slopes, inverse(told), slopes))
         field = of_field(plan, params, points)
         rms, largest = field.errors(inverse(told))

@@ -29,6 +29,7 @@ __all__ = [
     "DisplacementField",
     "FieldPoints",
     "displacement_covariance",
+    "displacement_derivatives",
     "displacement_field",
     "field_error",
     "field_points",
@@ -181,14 +182,31 @@ def displacement_covariance(
     ndarray, shape (..., 2, 2), pixel^2
         NaN where no object is imaged.
     """
+    derivatives = displacement_derivatives(posterior, params, u, v)
+    return np.asarray(derivatives @ covariance @ derivatives.swapaxes(-1, -2))
+
+
+def displacement_derivatives(posterior: Posterior, params: Floats, u: Floats, v: Floats) -> Floats:
+    """Derivatives of the displacement at points with respect to the parameters.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+    u, v : ndarray, shape (...), pixel of the fine grid
+
+    Returns
+    -------
+    ndarray, shape (..., 2, d), pixel per unit of each parameter
+        NaN where no object is imaged.
+    """
     theta, offset = displacing(posterior.parameters, params)
     jacobian = posterior.model.polynomial.displacement_jacobian(
         theta, u.ravel(), v.ravel(), offset=offset
     )
     # which of the parameters the Jacobian's columns are
     columns = np.column_stack(displacing(posterior.parameters, np.eye(params.size)))
-    derivatives = jacobian @ columns.T
-    return (derivatives @ covariance @ derivatives.swapaxes(1, 2)).reshape(*u.shape, 2, 2)
+    return np.asarray((jacobian @ columns.T).reshape(*u.shape, 2, params.size))
 
 
 def field_error(points: FieldPoints, covariance: Floats) -> float:

@@ -28,20 +28,19 @@ from dataclasses import replace
 import numpy as np
 
 from bayesfred._typing import Flags, Floats, Ints
-from bayesfred.analysis.field import FieldPoints
+from bayesfred.analysis.field import FieldPoints, displacement_derivatives
 from bayesfred.analysis.folds import fold_sources
 from bayesfred.analysis.optimal import Field
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.likelihood import FrameLikelihood
-from bayesfred.model.parameters import SCALES, displacing
+from bayesfred.model.parameters import SCALES
 from bayesfred.model.pixels import footprints
 from bayesfred.model.posterior import Posterior
 
 __all__ = [
     "by_pointing",
     "by_source",
-    "derivatives",
     "of_field",
     "planned",
     "selected",
@@ -267,29 +266,6 @@ def shared_terms(posterior: Posterior) -> Ints:
     return np.array(out)
 
 
-def derivatives(posterior: Posterior, params: Floats, u: Floats, v: Floats) -> Floats:
-    """Derivatives of the displacement at points with respect to the parameters.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    params : ndarray, shape (d,)
-    u, v : ndarray, shape (...), pixel of the fine grid
-
-    Returns
-    -------
-    ndarray, shape (..., 2, d), pixel per unit of each parameter
-        NaN where no object is imaged.
-    """
-    theta, offset = displacing(posterior.parameters, params)
-    jacobian = posterior.model.polynomial.displacement_jacobian(
-        theta, u.ravel(), v.ravel(), offset=offset
-    )
-    # which of the parameters the Jacobian's columns are
-    columns = np.column_stack(displacing(posterior.parameters, np.eye(params.size)))
-    return np.asarray((jacobian @ columns.T).reshape(*u.shape, 2, params.size))
-
-
 def of_field(posterior: Posterior, params: Floats, points: FieldPoints) -> Field:
     """The points of a frame that count in averages, with the derivatives there.
 
@@ -309,7 +285,7 @@ def of_field(posterior: Posterior, params: Floats, points: FieldPoints) -> Field
         If no object is imaged at any of them.
     """
     counted = points.weights > 0.0
-    every = derivatives(posterior, params, points.u[counted], points.v[counted])
+    every = displacement_derivatives(posterior, params, points.u[counted], points.v[counted])
     known = np.isfinite(every).all(axis=(1, 2))
     if not known.any():
         raise InputError(
