@@ -24,8 +24,8 @@ from bayesfred.analysis.field import (
     field_points,
     pixel_unit,
 )
+from bayesfred.analysis.planned import planned
 from bayesfred.errors import InputError
-from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 
@@ -126,27 +126,10 @@ def photons_needed(posterior: Posterior, params: npt.ArrayLike, error: float) ->
 
 def _brighter(posterior: Posterior, params: Floats, fluxes: Floats) -> Posterior:
     """The posterior of a frame without noise whose sources have these fluxes."""
-    p, names = posterior, posterior.parameter_names
+    names, sources = posterior.parameter_names, posterior.model.sources
     scale = params[names.index("flux_scale")] if "flux_scale" in names else 1.0
-    s = p.model.sources
-    model = replace(p.model, sources=replace(s, flux=fluxes / scale))
-    # free fluxes would be those of the old counts, and the scales are no part of the mean
-    flux = "fixed" if p.nuisances.flux == "free" else p.nuisances.flux
-    kept = [name not in SCALES for name in names]
-    known = Posterior(
-        model,
-        p.counts,
-        prior={name: p.prior[name] for name, keep in zip(names, kept, strict=True) if keep},
-        noise=p.noise,
-        mask=p.mask,
-        nuisances=replace(p.nuisances, flux=flux, position_scatter=False, model_error=False),
-    )
-    if known.nuisances == p.nuisances:  # the information does not depend on the counts
-        return known
-    counts = known.expected_counts(params[kept])
-    return Posterior(
-        model, counts, prior=p.prior, noise=p.noise, mask=p.mask, nuisances=p.nuisances
-    )
+    model = replace(posterior.model, sources=replace(sources, flux=fluxes / scale))
+    return planned(replace(posterior, model=model, extrapolation=None), params)
 
 
 def laplace_error(posterior: Posterior, params: Floats, points: FieldPoints) -> float:
