@@ -135,7 +135,10 @@ def _target(
         raise InputError(f"{run_file}: catalogue.{error}") from None
     flux = np.maximum(found.flux, 1.0)
     sources = SourceCatalog(binning * found.x, binning * found.y, flux)
-    return sources, [f"grid: {found.message}"]
+    notes = [f"grid: {found.message}"]
+    if grid.marks == "dots":
+        notes.append("dots: counts inverted, twice the white level less the counts")
+    return sources, notes
 
 
 def bright(
@@ -165,8 +168,8 @@ def bright(
         return frame.counts, noise
     if not isinstance(noise, PoissonNoise):
         raise InputError(
-            f"{run_file}: noise: got {type(noise).__name__} with marks = 'dots', expected the "
-            "default, whose read noise is used"
+            f"{run_file}: noise: got {type(noise).__name__} with marks = 'dots', expected kind = "
+            "'poisson', whose read noise is used"
         )
     counts, variance = invert_dots(frame.counts, frame.valid)
     return counts, GaussianNoise(variance + noise.read_noise**2)

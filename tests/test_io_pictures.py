@@ -14,7 +14,7 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from bayesfred.errors import InputError
-from bayesfred.io.frames import require_memory
+from bayesfred.io.frames import read_frame, require_memory, write_frame
 from bayesfred.io.pictures import read_picture
 
 Array = np.ndarray[Any, Any]
@@ -339,3 +339,24 @@ def test_a_refused_file_leaves_nothing_open(tmp_path: Path) -> None:
     for _ in range(5):
         message(path)
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_picture_is_a_frame(tmp_path: Path) -> None:
+    """Read as counts; without a gain that is said, and a saturated one is refused."""
+    rng = np.random.default_rng(2)
+    image = rng.poisson(90.0, (40, 50)).astype(np.uint8)
+    Image.fromarray(image).save(tmp_path / "dim.png")
+    frame = read_frame(tmp_path / "dim.png")
+    assert np.array_equal(frame.counts, image)
+    assert "no gain: stored numbers taken as photo-electrons" in frame.description
+    assert "no gain" not in read_frame(tmp_path / "dim.png", gain=2.0).description
+    Image.fromarray(np.minimum(image.astype(int) * 4, 255).astype(np.uint8)).save(
+        tmp_path / "bright.tiff"
+    )
+    with pytest.raises(InputError, match=r"bright\.tiff: got .*% of the pixels at the maximum"):
+        read_frame(tmp_path / "bright.tiff")
+    assert read_frame(tmp_path / "bright.tiff", saturation=300.0).n_masked == 0
+    with pytest.raises(InputError, match="expected none, as a picture holds one image"):
+        read_frame(tmp_path / "dim.png", name="SCI")
+    with pytest.raises(InputError, match="expected FITS, HDF5 or NPY"):
+        write_frame(tmp_path / "new.png", image)

@@ -29,7 +29,7 @@ from bayesfred.io.headers import conversion
 from bayesfred.io.paths import may_write
 from bayesfred.io.pictures import read_picture
 from bayesfred.io.reading import readable, require_file
-from bayesfred.io.saturation import plateau
+from bayesfred.io.saturation import plateau, suspicion
 from bayesfred.io.tangent_plane import TangentPlane
 
 __all__ = [
@@ -162,14 +162,13 @@ def read_frame(
     finite = np.isfinite(stored)
     masks = {"NaN": np.isnan(stored), "infinite": np.isinf(stored)}
     masks |= {f"flagged in {flagging}": flags for flagging, flags in image.flags.items()}
+    if image.largest is not None and known.gain is None:
+        notes.append("no gain: stored numbers taken as photo-electrons")
     level, why = known.saturation, "saturated"
     if level is None:
         level, why = plateau(stored[finite], image.largest), "suspected of saturation"
         if level is not None:
-            notes.append(
-                f"saturation suspected at the maximum of {level:.9g}: give a higher saturation if "
-                "that is wrong"
-            )
+            notes.append(suspicion(path, level, float(np.mean(stored[finite] >= level))))
     if level is not None:
         masks[why] = finite & (stored >= level)
     valid = ~np.any(list(masks.values()), axis=0)

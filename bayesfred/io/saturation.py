@@ -7,13 +7,17 @@ maximum, n others in these levels put more than k at M with at most the binomial
 where that is tiny, the levels end at M because the detector does.
 """
 
+from pathlib import Path
+
 import numpy as np
 from scipy.special import bdtrc
 
 from bayesfred._typing import Floats
+from bayesfred.errors import InputError
 
-__all__ = ["plateau"]
+__all__ = ["plateau", "suspicion"]
 
+MOST_SATURATED = 0.5  # share of the pixels
 CHANCE = 1e-3  # of suspecting a frame without saturated pixels, at most
 TOP = 0.1  # share of the range, from the median to the maximum, that is compared with the maximum
 # Of 12, 14, 15 and 16 bits, and of 12 and 14 bits in the upper ones of 16: one pixel is suspect.
@@ -58,3 +62,33 @@ def plateau(stored: Floats, largest: float | None = None) -> float | None:
     if more and bdtrc(more - 1, others, 1.0 / levels) < CHANCE:
         return top
     return None
+
+
+def suspicion(path: Path, level: float, share: float) -> str:
+    """The line on pixels that seem saturated.
+
+    Parameters
+    ----------
+    path : Path
+    level : float, stored units
+    share : float
+        Of the pixels.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        If half of the pixels are, which no fit can use.
+    """
+    if share > MOST_SATURATED:
+        raise InputError(
+            f"{path}: got {share:.0%} of the pixels at the maximum of {level:.9g}, expected a "
+            "frame that is not saturated: expose it less, or give saturation if it is not"
+        )
+    return (
+        f"saturation suspected at the maximum of {level:.9g}: give a higher saturation if that is "
+        "wrong"
+    )

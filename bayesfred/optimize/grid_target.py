@@ -27,6 +27,7 @@ SCATTER = 0.05  # largest scatter of a lattice, in pitches
 SHARE = 0.35  # of the marks that are not much fainter, on the grid
 BORDER, MOST = 0.5, 0.6  # shares of its border and of all marks by which a grid is seen whole
 STRAY = 0.03  # share of the marks that may lie beyond the target's rows and columns
+FAINTEST = 0.2  # of the median flux of as many peaks as there are marks: no mark
 MIDDLE = 60  # marks from which the lattice in the middle of the frame is taken
 
 
@@ -144,6 +145,10 @@ def index_grid(counts: Floats, valid: Flags, target: GridTarget, width: float) -
     sign = -1.0 if target.marks == "dots" else 1.0
     variance = np.maximum(counts, 1.0)
     points, flux = find_marks(sign * counts, variance, valid, width, target.rows * target.columns)
+    # peaks of the noise beside a mark can take its place in the lattice
+    brightest = np.sort(flux)[-target.rows * target.columns :]
+    real = flux > FAINTEST * np.median(brightest) if len(flux) else np.zeros(0, dtype=bool)
+    points, flux = points[real], flux[real]
     lattice = index_points(points, flux, target.layout)
     number = len(lattice.points)
     bright = np.sum(flux > 0.3 * np.median(flux[lattice.points])) if number else 0
