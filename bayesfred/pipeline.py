@@ -126,12 +126,12 @@ def read_frame(
     frame = frames.read_frame(
         path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
-    note(frame.description)
     noise, line = build.noise_given(run, frame.read_noise)
-    note(line)
+    note(frame.description, line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = build.reference_psf(run, run_file)
-    sources, lines = find_sources(run, run_file, shape, psf, frame)
+    with searching("finding the sources") if say else nullcontext():
+        sources, lines = find_sources(run, run_file, shape, psf, frame)
     note(*lines)
     counts, noise = bright(run, run_file, frame, noise)
     with naming(run_file):

@@ -110,10 +110,10 @@ class CatalogueSettings(Section):
         Columns of right ascension and declination (ICRS), in place of x and y: in the unit of the
         column, degrees without one, or texts such as 12:34:56.7.
     pm_ra, pm_dec : str, optional
-        Columns of the proper motions, milliarcsecond a year; along right ascension with the cosine
-        of the declination.
+        Columns of the proper motions, in the unit of the column, milliarcsecond a year without one;
+        along right ascension with the cosine of the declination.
     epoch : float, optional, Julian year
-        Of ra and dec where there are proper motions, by default 2000.
+        Of ra and dec; needed with proper motions.
     flux : str
         Column of the fluxes, counts; not needed where [nuisances] has them free.
     magnitude : str, optional
@@ -146,6 +146,8 @@ class CatalogueSettings(Section):
             raise ValueError("got columns of a file, expected none with a grid")
         if self.ra is not None and (self.x, self.y) != ("x", "y"):
             raise ValueError("got x or y, expected them without ra and dec only")
+        if self.pm_ra is not None and self.epoch is None:
+            raise ValueError("got proper motions without epoch, expected it: 2016.0 for Gaia DR3")
         if self.ra is None and (self.pm_ra or self.epoch):
             raise ValueError("got pm_ra or epoch, expected them with ra and dec only")
         return self

@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -367,11 +368,14 @@ def test_other_readers_agree(convention: str, program: str, tmp_path: Path) -> N
     assert distances(calibration, ra, dec, index).max() < limit < 0.01
 
 
-def test_gwcs_points_where_the_calibration_does(tmp_path: Path) -> None:
+@pytest.mark.parametrize("pole", [False, True])
+def test_gwcs_points_where_the_calibration_does(tmp_path: Path, pole: bool) -> None:
+    """Near a pole too, where a frame is no rectangle in RA and Dec."""
     pytest.importorskip("gwcs", reason="gwcs is not installed")
     pytest.importorskip("asdf_astropy", reason="asdf-astropy is not installed")
     asdf = pytest.importorskip("asdf")
-    calibration = made(PLANES["mirrored"])
+    plane = PLANES["mirrored"]
+    calibration = made(replace(plane, dec=89.95) if pole else plane)
     export = generalized_wcs(calibration, 4)
     export.write(tmp_path / "frame.asdf")
     index = some_pixels(calibration)
@@ -385,10 +389,8 @@ def test_gwcs_points_where_the_calibration_does(tmp_path: Path) -> None:
         at = wcs.pixel_to_world(*index)
         assert distances(calibration, at.ra.deg, at.dec.deg, index).max() < limit
         true, _ = calibration.to_sky(*calibration.from_index(*index))
-        back = np.array(wcs.backward_transform(true.ra.deg, true.dec.deg))
+        back = np.array(wcs.world_to_pixel(true))
         assert np.hypot(*(back - index)).max() < 1.05 * export.inverse.largest + 1e-9
-        assert np.isnan(wcs(-1.0, 5.0)).all() and np.isnan(wcs(5.0, 200.0)).all()
-        assert np.isfinite(wcs(309.0, 199.0)).all()
     header = sip(calibration, 4)
     assert export.forward.largest == pytest.approx(header.forward.largest, rel=1e-6)
     assert draws.colnames == header.draws.colnames

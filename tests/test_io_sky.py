@@ -13,7 +13,7 @@ from astropy.wcs import WCS
 import bayesfred as bf
 from bayesfred.io.catalogues import read_sky_catalogue
 from bayesfred.io.frames import read_frame
-from bayesfred.io.sky import degrees, moved, plane_of_wcs
+from bayesfred.io.sky import degrees, header_date, moved, plane_of_wcs
 from bayesfred.io.tangent_plane import TangentPlane
 
 PLANES = {
@@ -198,6 +198,51 @@ def test_proper_motion(tmp_path: Path) -> None:
         read_sky_catalogue(tmp_path / "stars.csv", flux=None, motion=("a", "b"))
     with pytest.raises(bf.InputError, match="date: got 'yesterday'"):
         moved(ra, dec, (ra, dec), 2000.0, "yesterday")
+
+
+def test_units_of_columns_are_honoured(tmp_path: Path) -> None:
+    """A proper motion of an arcsecond a year is not one of a milliarcsecond."""
+    from astropy import units
+
+    found = []
+    for scale, unit in ((1.0, None), (1e-3, "arcsec / yr"), (1e-3 / 3600.0, "deg / yr")):
+        table = Table({"ra": [10.0], "dec": [20.0], "a": [500.0 * scale], "b": [-200.0 * scale]})
+        for name in ("a", "b") if unit else ():
+            table[name].unit = units.Unit(unit)
+        table.write(tmp_path / "stars.ecsv", overwrite=True)
+        record = read_sky_catalogue(
+            tmp_path / "stars.ecsv", flux=None, motion=("a", "b"), epoch=2000.0, date="2020-01-01"
+        )
+        found.append([record.ra[0], record.dec[0]])
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=0.0, atol=1e-9)
+    assert found[0][1] == pytest.approx(20.0 - 20.0 * 0.2 / 3600.0, abs=1e-6)
+    for column, unit in (("ra", "m"), ("a", "m / s")):
+        table = Table({"ra": [10.0], "dec": [20.0], "a": [5.0], "b": [2.0]})
+        table[column].unit = units.Unit(unit)
+        table.write(tmp_path / "stars.ecsv", overwrite=True)
+        with pytest.raises(bf.InputError, match=f"column '{column}': got the unit '{unit}'"):
+            read_sky_catalogue(
+                tmp_path / "stars.ecsv", flux=None, motion=("a", "b"), date="2020-01-01"
+            )
+
+
+def test_degrees_among_texts_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "stars.csv").write_text("ra,dec\n05:32:00,1\n83.0,2\n")
+    with pytest.raises(bf.InputError, match=r"row 2, column 'ra': got '83\.0'"):
+        read_sky_catalogue(tmp_path / "stars.csv", flux=None)
+
+
+@pytest.mark.parametrize(
+    ("cards", "date"),
+    [
+        ({"MJD-OBS": 58849.0, "DATE-OBS": "2019-07-29"}, "2019-07-29"),
+        ({"MJD-OBS": 58849.0}, "2020-01-01T00:00:00.000"),
+        ({"DATE-BEG": "2020-01-01T00:00:00"}, "2020-01-01T00:00:00"),
+        ({}, None),
+    ],
+)
+def test_dates_of_headers(cards: dict[str, object], date: str | None) -> None:
+    assert header_date(cards) == date
 
 
 def test_from_sky_says_what_is_missing() -> None:

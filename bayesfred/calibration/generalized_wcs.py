@@ -19,7 +19,6 @@ import numpy as np
 from astropy import units
 from astropy.coordinates import ICRS
 from astropy.modeling import Model, models
-from astropy.modeling.bounding_box import ModelBoundingBox
 from astropy.table import Table
 
 from bayesfred._typing import PathLike
@@ -112,12 +111,12 @@ def generalized_wcs(calibration: Calibration, degree: int = 3) -> GeneralizedWCS
     plane = models.AffineTransformation2D(cd)
     transform = shift | bend | plane | models.Pix2Sky_TAN() | turn
     rows, columns = calibration.detector.shape
-    frame = (-0.5, columns - 0.5), (-0.5, rows - 0.5)
-    transform.bounding_box = ModelBoundingBox.validate(transform, frame, order="F")
     frames = gwcs.coordinate_frames
     detector = frames.Frame2D(name="detector", axes_order=(0, 1), unit=(units.pix, units.pix))
     world = frames.CelestialFrame(name="icrs", reference_frame=ICRS(), unit=(units.deg, units.deg))
     wcs = gwcs.WCS([(detector, transform), (world, None)])
+    # without a bounding box: gwcs would hold directions against a rectangle in RA and Dec around
+    # the frame's corners, and give NaN for parts of a frame near a pole
     wcs.pixel_shape = columns, rows
     pixels = nodes(calibration.detector.shape, even=True)
     (true,) = objects(calibration, pixels, draws=False)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy import units
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
@@ -34,6 +35,7 @@ __all__ = [
     "write_catalogue",
 ]
 
+MOTION = units.mas / units.yr
 _FORMATS = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv"}
 
 
@@ -150,8 +152,8 @@ def read_sky_catalogue(
     flux, magnitude, zero_point
         As for `read_catalogue`.
     motion : (str, str), optional
-        Columns of the proper motions (milliarcsecond a year): along right ascension, with the
-        cosine of the declination, and along declination.
+        Columns of the proper motions, in the unit of the column or milliarcsecond a year: along
+        right ascension, with the cosine of the declination, and along declination.
     epoch : float, Julian year
         Of the directions.
     date : str, optional
@@ -190,7 +192,7 @@ def read_sky_catalogue(
             raise InputError(
                 f"{path}: got proper motions, expected the date of the frame too: give sky.date"
             )
-        rates = _column(path, table, motion[0]), _column(path, table, motion[1])
+        rates = _rates(path, table, motion[0]), _rates(path, table, motion[1])
         right, up = moved(right, up, rates, epoch, date)
     _require_distinct(path, right, up)
     return SkyRecord(right, up, fluxes)
@@ -279,19 +281,37 @@ def _angles(path: Path, table: Table, name: str, *, hours: bool) -> Floats:
     """A column of angles in degrees."""
     column = _present(path, table, name)
     if column.dtype.kind not in "OSU":
-        return degrees(_column(path, table, name), column.unit, hours=hours)
+        try:
+            return degrees(_column(path, table, name), column.unit, hours=hours)
+        except units.UnitsError:
+            raise InputError(
+                f"{path}: column {name!r}: got the unit {str(column.unit)!r}, expected that of an "
+                "angle, such as deg"
+            ) from None
     angles = np.empty(len(table))
     for row, cell in enumerate(column):
         try:
             angles[row] = degrees([cell], None, hours=hours)[0]
         except ValueError:
             angles[row] = np.nan
-        if not math.isfinite(angles[row]):
+        if not abs(angles[row]) <= 360.0:
             raise InputError(
                 f"{path}: row {row + 1}, column {name!r}: got {str(cell)!r}, expected degrees, or "
                 "a text such as 12:34:56.7"
             )
     return angles
+
+
+def _rates(path: Path, table: Table, name: str) -> Floats:
+    """A column of proper motions in milliarcsecond a year, which it is in without a unit."""
+    values, unit = _column(path, table, name), table[name].unit
+    try:
+        return np.asarray(values if unit is None else (values * unit).to_value(MOTION))
+    except (TypeError, units.UnitConversionError):
+        raise InputError(
+            f"{path}: column {name!r}: got the unit {str(unit)!r}, expected that of a proper "
+            "motion, such as mas/yr"
+        ) from None
 
 
 def _present(path: Path, table: Table, name: str) -> Any:

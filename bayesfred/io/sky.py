@@ -26,7 +26,8 @@ from bayesfred.io.tangent_plane import TangentPlane, rows
 __all__ = ["degrees", "header_date", "header_plane", "icrs", "moved", "plane_of_wcs"]
 
 STEP = 0.5  # pixel, of the slope: small beside any distortion, large beside rounding
-DATES = ("DATE-OBS", "DATE_OBS")
+DATES = ("DATE-OBS", "DATE_OBS", "DATE-BEG", "DATE-AVG")
+DAYS = ("MJD-OBS", "MJD-BEG", "MJD-AVG")
 
 
 def plane_of_wcs(wcs: Any, shape: tuple[int, int], *, binning: int = 1) -> TangentPlane:
@@ -102,7 +103,11 @@ def header_plane(header: Any, shape: tuple[int, int]) -> TangentPlane | None:
 
 def header_date(header: Mapping[str, Any]) -> str | None:
     """When a FITS header says that the frame was taken; None where it does not."""
-    return next((str(header[key]) for key in DATES if str(header.get(key, "")).strip()), None)
+    found = next((str(header[key]) for key in DATES if str(header.get(key, "")).strip()), None)
+    if found is None:
+        days = next((header[key] for key in DAYS if isinstance(header.get(key), int | float)), None)
+        found = None if days is None else str(Time(days, format="mjd").isot)
+    return found
 
 
 def icrs(coordinates: Any) -> tuple[Floats, Floats]:

@@ -14,11 +14,13 @@ then fitted to all stars that agree. The terms of degree 1 and the offset of the
 over from there.
 """
 
+import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import spatial, stats
+from scipy import ndimage, spatial, stats
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
@@ -27,6 +29,7 @@ from bayesfred.io.tangent_plane import ARCSEC, Parity, TangentPlane, rows
 __all__ = ["Pose", "find_pose"]
 
 POINTING_ERROR = 1.0  # degree: largest error of the guess
+NEARER = (0.1, 0.3, 1.0)  # shares of it that are tried in turn: the cost grows with the area
 SCALE_ERROR = 0.05
 ANGLE_ERROR = 5.0  # degree, of a position angle that is given
 BRIGHTEST = (30, 50)  # peaks that make pairs; the second where the first show no pose
@@ -36,6 +39,13 @@ NEAR = 0.006  # a peak is near to a star, of the frame's diagonal
 CHANCE = 1e-6  # largest probability that peaks agree by chance
 LEAST_NEAR = 1.0  # pixel: least distance within which stars and peaks are matched in the end
 ROUNDS = 10
+FINE = 3  # cells of the raster for the distance within which a peak is near to a star
+LARGEST = 8192  # cells along a side of the raster
+MOST_PEAKS = 100
+DEEPER = 4.0  # the brightest stars against which a pose is tested, for each peak of the frame
+BLOCK = 2**17  # similarities that are tested at once: what fits the memory
+LONGEST = 3e7  # similarities of one search; those of the brightest peaks come first
+MOST_TRIED = 1e10  # similarities: of so many none agrees by chance with what ends a search early
 
 Complex = NDArray[np.complex128]
 
@@ -117,9 +127,10 @@ def find_pose(
     diagonal = float(np.hypot(*shape))
     bright = np.argsort(-stars[2], kind="stable")
     found = None
-    for number in BRIGHTEST:
+    for number, share in itertools.product(BRIGHTEST, NEARER):
         if found is None:
-            found = _search(on_frame, stars, bright, guess, shape, (number, angle, parity))
+            reach = share * POINTING_ERROR
+            found = _search(on_frame, stars, bright, guess, shape, (number, reach, angle, parity))
     if found is None:
         limits = "" if angle is None else f", {ANGLE_ERROR:g} degrees of the position angle"
         raise InputError(
@@ -137,49 +148,80 @@ def _search(
     bright: Ints,
     guess: TangentPlane,
     shape: tuple[int, int],
-    known: tuple[int, float | None, Parity | None],
+    known: tuple[int, float, float | None, Parity | None],
 ) -> TangentPlane | None:
     """The best similarity of all pairs; None if chance could have made it."""
-    number, angle, parity = known
+    number, reach, angle, parity = known
     scale, diagonal = guess.pixel_scale / ARCSEC, float(np.hypot(*shape))
     flat = TangentPlane(guess.ra, guess.dec, ((scale, 0.0), (0.0, scale)))
     xi, eta = flat.to_plane(*stars[:2])
-    radius = 0.5 * diagonal + POINTING_ERROR / scale
+    radius = 0.5 * diagonal + reach / scale
     order = bright[np.hypot(xi[bright], eta[bright]) < (1.0 + SCALE_ERROR) * radius]
-    field = xi[order] + 1j * eta[order]
     share = np.pi * radius**2 / (shape[0] * shape[1])
+    # stars much fainter than the frame's would be near to every point
+    order = order[: int(DEEPER * share * min(len(peaks), MOST_PEAKS))]
+    field = xi[order] + 1j * eta[order]
     some = field[: int(MORE_STARS * number * share)]
-    best, plane, tried = 0, None, 0
-    for mirrored in (False, True):
-        if parity is not None and mirrored != (parity == "mirrored"):
-            continue
-        a, b = _similarities(peaks[:number], _flipped(some, mirrored=mirrored), diagonal)
-        kept = np.abs(b) < POINTING_ERROR / scale
-        if angle is not None:
-            turn = np.degrees(np.angle(a)) if mirrored else -np.degrees(np.angle(a))
-            kept &= np.abs((turn - angle + 180.0) % 360.0 - 180.0) < ANGLE_ERROR
-        a, b = a[kept], b[kept]
-        tried += a.size
-        if a.size == 0:
-            continue
-        points = _flipped(field, mirrored=mirrored)
-        tree = spatial.cKDTree(np.stack([points.real, points.imag], axis=1))
-        near = (peaks[None, :number] - b[:, None]) / a[:, None]
-        distance = tree.query(
-            np.stack([near.real, near.imag], axis=-1), distance_upper_bound=NEAR * diagonal
-        )[0]
-        agree = np.isfinite(distance).sum(axis=1)
-        first = int(np.argmax(agree))
-        if agree[first] > best:
-            best = int(agree[first])
-            plane = _plane(flat, a[first], b[first], mirrored=mirrored)
+    if len(some) < 2:
+        return None
     by_chance = (
         len(peaks[:number]) * len(field) * np.pi * (NEAR * diagonal) ** 2 / (np.pi * radius**2)
     )
-    # two peaks of every similarity agree by its making
-    if tried * stats.poisson.sf(best - 3, by_chance) > CHANCE:
-        return None
-    return plane
+
+    def chance(agreeing: int, tried: float) -> float:
+        # two peaks of every similarity agree by its making
+        return float(tried * stats.poisson.sf(agreeing - 3, by_chance))
+
+    best, plane, tried, made = 0, None, 0, 0
+    for mirrored in (False, True):
+        if parity is not None and mirrored != (parity == "mirrored"):
+            continue
+        lookup = _Raster(_flipped(field, mirrored=mirrored), NEAR * diagonal)
+        for a, b in _similarities(peaks[:number], _flipped(some, mirrored=mirrored), diagonal):
+            made += a.size
+            if made > LONGEST:
+                break
+            kept = np.abs(b) < reach / scale
+            if angle is not None:
+                turn = np.degrees(np.angle(a)) if mirrored else -np.degrees(np.angle(a))
+                kept &= np.abs((turn - angle + 180.0) % 360.0 - 180.0) < ANGLE_ERROR
+            a, b = a[kept], b[kept]
+            tried += a.size
+            agree = lookup.agreeing(peaks[:number], a, b)
+            if agree.size and agree.max() > best:
+                first = int(np.argmax(agree))
+                best = int(agree[first])
+                plane = _plane(flat, a[first], b[first], mirrored=mirrored)
+                if chance(best, MOST_TRIED) < CHANCE:
+                    return plane
+    return plane if chance(best, tried) < CHANCE else None
+
+
+class _Raster:
+    """Which cells of the plane are near to a star: similarities are looked up there."""
+
+    def __init__(self, stars: Complex, near: float) -> None:
+        low, high = (f([f(stars.real), f(stars.imag)]) for f in (np.min, np.max))
+        self.low, self.cell = low, max(near / FINE, (high - low) / LARGEST)
+        side = int((high - low) / self.cell) + 3
+        empty = np.ones((side, side), dtype=bool)
+        row, column = (
+            np.rint((p - low) / self.cell).astype(int) + 1 for p in (stars.imag, stars.real)
+        )
+        empty[row, column] = False
+        self.occupied = ndimage.distance_transform_edt(empty) < near / self.cell
+        # what is beyond the catalogue ends here
+        self.occupied[[0, -1], :] = self.occupied[:, [0, -1]] = False
+
+    def agreeing(self, peaks: Complex, a: Complex, b: Complex) -> Ints:
+        """How many peaks each similarity brings near to a star."""
+        at = (peaks[None] - b[:, None]) / a[:, None]
+        row, column = (
+            np.clip(np.rint((p - self.low) / self.cell) + 1.0, 0, len(self.occupied) - 1)
+            for p in (at.imag, at.real)
+        )
+        near = self.occupied[row.astype(int), column.astype(int)]
+        return np.asarray(near.sum(axis=1, dtype=np.int64))
 
 
 def _flipped(stars: Complex, *, mirrored: bool) -> Complex:
@@ -187,26 +229,29 @@ def _flipped(stars: Complex, *, mirrored: bool) -> Complex:
     return stars if mirrored else np.asarray(-stars.conj())
 
 
-def _similarities(peaks: Complex, stars: Complex, diagonal: float) -> tuple[Complex, Complex]:
-    """a and b of all pairs of peaks and of stars with a similar distance."""
+def _similarities(
+    peaks: Complex, stars: Complex, diagonal: float
+) -> Iterator[tuple[Complex, Complex]]:
+    """a and b of all pairs of peaks and of stars with a similar distance, some at a time."""
     i, j = np.triu_indices(len(peaks), 1)
-    k, m = np.triu_indices(len(stars), 1)
-    long = np.abs(peaks[i] - peaks[j]) > SHORTEST * diagonal
-    i, j = i[long], j[long]
+    wanted = np.abs(peaks[i] - peaks[j])
+    long = wanted > SHORTEST * diagonal
+    i, j, wanted = i[long], j[long], wanted[long]
+    tree = spatial.cKDTree(np.stack([stars.real, stars.imag], axis=1))
+    longest = (1.0 + SCALE_ERROR) * float(wanted.max(initial=0.0))
+    k, m = tree.query_pairs(longest, output_type="ndarray").T
     lengths = np.abs(stars[k] - stars[m])
     order = np.argsort(lengths)
     k, m, lengths = k[order], m[order], lengths[order]
-    wanted = np.abs(peaks[i] - peaks[j])
     low = np.searchsorted(lengths, wanted * (1.0 - SCALE_ERROR))
     high = np.searchsorted(lengths, wanted * (1.0 + SCALE_ERROR))
-    pair = np.repeat(np.arange(i.size), high - low)
-    other = np.arange(pair.size) - np.repeat(np.cumsum(high - low) - (high - low), high - low)
-    other += low[pair]
-    d_1, d_2 = np.tile(peaks[i][pair], 2), np.tile(peaks[j][pair], 2)
-    s_1 = np.concatenate([stars[k][other], stars[m][other]])
-    s_2 = np.concatenate([stars[m][other], stars[k][other]])
-    a = (d_2 - d_1) / (s_2 - s_1)
-    return a, d_1 - a * s_1
+    for pair in range(i.size):
+        for first in range(low[pair], high[pair], BLOCK):
+            some = slice(first, min(first + BLOCK, high[pair]))
+            s_1 = np.concatenate([stars[k[some]], stars[m[some]]])
+            s_2 = np.concatenate([stars[m[some]], stars[k[some]]])
+            a = (peaks[j[pair]] - peaks[i[pair]]) / (s_2 - s_1)
+            yield a, peaks[i[pair]] - a * s_1
 
 
 def _plane(flat: TangentPlane, a: complex, b: complex, *, mirrored: bool) -> TangentPlane:
