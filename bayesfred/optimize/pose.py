@@ -133,11 +133,13 @@ def find_pose(
             found = _search(on_frame, stars, bright, guess, shape, (number, reach, angle, parity))
     if found is None:
         limits = "" if angle is None else f", {ANGLE_ERROR:g} degrees of the position angle"
+        limits += "" if parity is None else f", parity {parity!r}"
         raise InputError(
             f"sky: got no pose within {POINTING_ERROR:g} degree of RA {guess.ra:.4f}, Dec "
             f"{guess.dec:.4f}{limits} and {SCALE_ERROR:.0%} of {guess.pixel_scale:.4g} arcsec per "
-            "pixel at which the frame's stars are those of the catalogue, expected one: check "
-            "pointing, pixel_scale and the units of the catalogue"
+            f"pixel at which the frame's {len(peaks)} peaks are stars of the catalogue's "
+            f"{len(stars[0])}, more of them than by chance, expected one: check pointing, "
+            "pixel_scale and the units of the catalogue"
         )
     return _refined(on_frame, stars, found, NEAR * diagonal)
 
