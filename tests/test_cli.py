@@ -45,6 +45,7 @@ from bayesfred.pipeline import read_frame
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import fingerprint, open_chain
 from bayesfred.settings import RunSettings, read_settings
+from bayesfred.sources import STRAY
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BAYESFRED_DATA") or Path(__file__).parents[2] / "shared" / "data")
@@ -1001,7 +1002,7 @@ def test_sources_at_the_edge_are_kept_and_others_removed(folder: Path) -> None:
 def test_a_source_removed_as_outside_changes_no_pixel(simulated: Path) -> None:
     """A source just beyond gives no light, even if a distortion of 3 prior sd brings it nearer."""
     run = read_settings(simulated / "run.toml")
-    model = open_model(run, x=37.5 * (1 + build.STRAY) + 2.5 * (-2 * np.log(1e-8)) ** 0.5)
+    model = open_model(run, x=37.5 * (1 + STRAY) + 2.5 * (-2 * np.log(1e-8)) ** 0.5)
     prior = 0.1 / 37.5  # of f_ux: a tenth of the half-width at the corner
     theta = np.array([3 * prior, 0.0, 0.0]) * 37.5 / model.sources.x[0]
     assert model.expected_counts(theta).max() < 1e-7 * 5e3
