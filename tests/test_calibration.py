@@ -16,6 +16,8 @@ import bayesfred as bf
 from bayesfred._typing import Floats
 from bayesfred.calibration.maps import write_maps
 from bayesfred.io.tangent_plane import TangentPlane
+from bayesfred.model.parameters import displacing
+from bayesfred.sampling.displacement import spread_draws
 
 SKY = TangentPlane(83.0, -41.0, ((-0.004, 0.006), (0.006, 0.004)), (4.0, -3.0))
 SHAPE = (101, 141)
@@ -262,12 +264,12 @@ def p_values(number: int, *, doubt: float = 1.0) -> Floats:
 
 
 def test_difference_has_uniform_p_values() -> None:
-    """100 pairs without a change: a Kolmogorov test at 0.001.
+    """60 pairs without a change: a Kolmogorov test at 0.001.
 
     Errors 1.5 times too small fail it.
     """
-    assert stats.kstest(p_values(100), "uniform").pvalue > 1e-3
-    assert stats.kstest(p_values(100, doubt=1.5), "uniform").pvalue < 1e-3
+    assert stats.kstest(p_values(60), "uniform").pvalue > 1e-3
+    assert stats.kstest(p_values(60, doubt=1.5), "uniform").pvalue < 1e-3
 
 
 def test_difference_sees_the_lens() -> None:
@@ -323,9 +325,13 @@ def refits(number: int) -> tuple[Floats, Floats]:
         counts = planned.simulate(params, np.random.default_rng(seed))
         assert counts is not None
         chain = bf.laplace(bf.Posterior(model, counts, nuisances=moving), seed=seed, progress=False)
+        draws = np.hstack(displacing(planned.parameters, spread_draws(chain)))
+        if seed == 0:  # what judges the fit too, which takes longer than the fit
+            known = bf.Calibration.from_chain(chain)
+            assert np.array_equal(known.draws, draws)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", bf.ExtrapolationWarning)
-            at, covariance = bf.Calibration.from_chain(chain).to_sky(PLACES_U, PLACES_V)
+            at, covariance = replace(known, draws=draws).to_sky(PLACES_U, PLACES_V)
         off.append(np.stack([part.arcsec for part in truth.spherical_offsets_to(at)], axis=1))
         stated.append(covariance)
     return np.array(off), np.array(stated)

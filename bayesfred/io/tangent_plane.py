@@ -160,14 +160,21 @@ class TangentPlane:
         ndarray, shape (..., 2, 2), arcsecond per pixel
         """
         s, rho = self._direction(x, y)
-        ra, dec = np.arctan2(s[1], s[0]), np.arctan2(s[2], np.hypot(s[0], s[1]))
-        east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)])
-        north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-        _, *axes = _axes(self.ra, self.dec)
-        turn = np.array([[np.tensordot(axis, to, 1) for axis in axes] for to in (east, north)])
-        return np.asarray(
-            np.moveaxis(turn / rho, (0, 1), (-2, -1)) @ (ARCSEC * np.array(self.matrix))
-        )
+        sin_dec, cos_dec = s[2], np.hypot(s[0], s[1])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cos_ra, sin_ra = (
+                np.where(cos_dec > 0.0, p / cos_dec, q)
+                for p, q in zip(s[:2], (1.0, 0.0), strict=True)
+            )
+        _, e, n = _axes(self.ra, self.dec)
+        scaled = ARCSEC * np.array(self.matrix)
+        out = np.empty((*rho.shape, 2, 2))
+        for column in (0, 1):
+            step = scaled[0, column] * e + scaled[1, column] * n  # along x, and along y
+            along = cos_ra * step[0] + sin_ra * step[1]
+            out[..., 0, column] = (cos_ra * step[1] - sin_ra * step[0]) / rho
+            out[..., 1, column] = (cos_dec * step[2] - sin_dec * along) / rho
+        return out
 
     def _direction(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[Floats, Floats]:
         """The unit vectors of object points, shape (3, ...), and rho, shape (...)."""
