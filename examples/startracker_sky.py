@@ -3,7 +3,7 @@
     BAYESFRED_DATA=<folder with the frames> python examples/startracker_sky.py [--sample]
 
 Every frame is fitted as `bayesfred fit --map-only` does (with --sample as `bayesfred fit` does,
-some minutes each), into chains/, and its calibration is written there as a FITS header (TAN-SIP).
+an hour each), into chains/, and its calibration is written there as a FITS header (TAN-SIP).
 Then the header's positions of the catalogue's stars are held against centroids: least-squares
 Gaussians, which know nothing of the fit. A lens makes the four cubic terms x^3 and x y^2 of u,
 x^2 y and y^3 of v equal: their mean is printed in pixels at 512 pixels from the middle, frame by
