@@ -108,9 +108,9 @@ def difference(a: Calibration, b: Calibration) -> CalibrationDifference:
     order = np.argsort(-values)
     share = np.cumsum(values[order]) / values.sum()
     kept = order[: int(np.searchsorted(share, FIELD)) + 1]
-    # the covariance is that of finitely many draws: the mean of a chi-square corrected for it
-    number = min(len(field) for field in fields)
-    correction = np.sqrt(max(number - len(kept) - 2, 1) / (number - 1))
+    # the inverse of a covariance of finitely many draws is too large on average (Wishart)
+    number = sum(len(field) - 1 for field in fields)
+    correction = np.sqrt(max(number - len(kept) - 1, 1) / number)
     z = vectors[:, kept].T @ rest / np.sqrt(values[kept]) * correction
     agreement = Agreement.of(z)
     n = u.size

@@ -9,7 +9,7 @@ direction is where the plane touches the sky. With (h, k) the pixel counted from
 with A and B of the degrees 2 to N. They are fitted to the calibration by least squares, at nodes of
 Chebyshev over the whole frame, which keeps the largest error small. The fit is a polynomial about
 the middle of the frame; the reference pixel is its root, found by Newton's method, and the
-polynomial is expanded anew about it, which changes no value.
+polynomial is expanded again, about that pixel, which changes no value.
 
 A calibration need not be a polynomial of degree N, so the fit has a truncation error. Every draw of
 the calibration is fitted in the same way. `wcs` and `generalized_wcs` write what comes out.
