@@ -11,10 +11,12 @@ from .analysis.noise_study import NoiseStudy, noise_study
 from .analysis.photon_transfer import PhotonTransfer, photon_transfer
 from .analysis.photons import PhotonsNeeded, photons_needed
 from .analysis.prior_predictive import PriorPredictive, prior_predictive
+from .analysis.remote_frames import RemoteFrames
 from .analysis.sbc import SBCResult, simulation_based_calibration
 from .calibration.calibration import Calibration
 from .calibration.correct import correct
 from .calibration.corrected import CorrectedFrame
+from .calibration.self_calibration import SelfCalibration, self_calibrate
 from .errors import ExtrapolationWarning, InputError
 from .imaging.catalog import SourceCatalog
 from .imaging.detector import Detector, correct_sampling, sampling_matrix
@@ -22,6 +24,8 @@ from .imaging.distortion import PolynomialDistortion
 from .imaging.forward import ForwardModel
 from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MeasuredPSF, MoffatPSF, SampledPSF
+from .model.drift import Drift
+from .model.joint import JointPosterior
 from .model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from .model.parameters import Nuisances
 from .model.posterior import Posterior
@@ -52,6 +56,7 @@ __all__ = [
     "Detector",
     "Diagnostics",
     "DisplacementField",
+    "Drift",
     "Evidence",
     "ExtrapolationWarning",
     "ForwardModel",
@@ -60,6 +65,7 @@ __all__ = [
     "GridImage",
     "GridTarget",
     "InputError",
+    "JointPosterior",
     "LaplaceMove",
     "LogDistortion",
     "MapEstimate",
@@ -73,9 +79,11 @@ __all__ = [
     "PolynomialDistortion",
     "Posterior",
     "PriorPredictive",
+    "RemoteFrames",
     "RunRecord",
     "SBCResult",
     "SampledPSF",
+    "SelfCalibration",
     "SourceCatalog",
     "TermChoice",
     "UncataloguedSources",
@@ -107,6 +115,7 @@ __all__ = [
     "reject_outliers",
     "sample",
     "sampling_matrix",
+    "self_calibrate",
     "show",
     "simulate",
     "simulation_based_calibration",

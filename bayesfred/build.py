@@ -1,6 +1,8 @@
 """From the settings of a run file to the objects that they describe."""
 
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -16,11 +18,43 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFFile, PSFToMeasure, has_pixel
 from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
+from bayesfred.joint_settings import JointRun
 from bayesfred.model import priors
 from bayesfred.model.noise import Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
 from bayesfred.simulation_sections import SimulationSettings
 from bayesfred.sources import find_sources
+
+SECTIONS = ("frame", "catalogue", "psf", "noise")  # that may name a file
+
+
+def inputs(
+    run: settings.RunSettings | JointRun, run_file: Path, sections: Sequence[str] = SECTIONS
+) -> list[Path]:
+    """The run file, and the files that its sections name, whether they are there or not."""
+    runs = run.frames.values() if isinstance(run, JointRun) else (run,)
+    named = (getattr(getattr(own, part), "path", None) for own in runs for part in sections)
+    files = dict.fromkeys(path for path in named if path)  # frames may have one catalogue
+    return [run_file, *(resolve(path, run_file) for path in files)]
+
+
+@contextmanager
+def naming(run_file: Path) -> Iterator[None]:
+    """Begin the line of an error with the run file that describes what was refused.
+
+    Parameters
+    ----------
+    run_file : Path
+
+    Raises
+    ------
+    InputError
+        In place of the one raised within.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{run_file}: {error}") from None
 
 
 def reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
@@ -57,8 +91,8 @@ def forward_model(
     )
 
 
-def priors_given(run: settings.RunSettings) -> dict[str, Any]:
-    """The priors of [prior]."""
+def priors_given(run: settings.RunSettings | JointRun) -> dict[str, Any]:
+    """The priors of [prior]; of several frames those that no frame has alone."""
     return {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
 
 
@@ -116,7 +150,8 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
         sources = SourceCatalog.grid(s.grid.side, s.grid.spacing, s.grid.flux)
     else:
         sources = find_sources(run, run_file, s.shape, psf)[0]
-    model = forward_model(run, s.shape, sources, psf)
+    with naming(run_file):
+        model = forward_model(run, s.shape, sources, psf)
     unknown = sorted(set(s.theta) - set(model.distortion.names))
     if unknown:
         raise InputError(
@@ -125,8 +160,9 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
         )
     theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
     noise = run.noise.make()
-    counts = simulate(model, theta, s.background, seed=seed, noise=noise)
-    posterior = posterior_given(run, model, counts, None, noise)
+    with naming(run_file):
+        counts = simulate(model, theta, s.background, seed=seed, noise=noise)
+        posterior = posterior_given(run, model, counts, None, noise)
     known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
     known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
     truth = np.array([known.get(name, 0.0) for name in posterior.parameter_names])

@@ -113,7 +113,10 @@ def fit(
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report."""
+    """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report.
+
+    Of several frames, in [[frames]], it is the posterior of the lens that they share.
+    """
     _run(
         lambda: bf.show.show_run(
             bf.commands.fit(
@@ -258,6 +261,10 @@ def calibration(
         float | None,
         typer.Option(help="For OpenCV, recorded pixels.", show_default="from the sky"),
     ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Of several frames, this one.", show_default="the only"),
+    ] = None,
     regions: Annotated[
         bool, typer.Option("--regions", help="Residuals of the sources, for DS9.")
     ] = False,
@@ -285,6 +292,7 @@ def calibration(
                 form=form,
                 degree=degrees.get(form or "") or 3,
                 focal_length=focal_length,
+                frame=frame,
                 out=out,
                 overwrite=overwrite,
                 say=print,

@@ -104,7 +104,7 @@ def init(
     path = Path(f"{stem}.toml" if out is None else out)
     if path.suffix != ".toml":
         raise InputError(f"{path}: got a run file of this name, expected one ending in .toml")
-    may_write(path, overwrite=overwrite)
+    may_write(path, overwrite=overwrite, inputs=[frame, *([] if second is None else [second])])
     image = read_stored(frame)
     others = [image] if second is None else [image, read_stored(Path(second))]
     used = [_masked(each) for each in others]

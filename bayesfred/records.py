@@ -17,7 +17,16 @@ from bayesfred.io.summary_table import Table
 from bayesfred.model.posterior import Posterior
 from bayesfred.sampling.chain import Chain
 
-__all__ = ["Calibrated", "Compared", "Corrected", "Planned", "Result", "Simulated", "Study"]
+__all__ = [
+    "Calibrated",
+    "Compared",
+    "Corrected",
+    "JointResult",
+    "Planned",
+    "Result",
+    "Simulated",
+    "Study",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +56,46 @@ class Result:
     picture: Path
     sources: Path
     photons: PhotonsNeeded | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """What a finished run of several frames left.
+
+    Attributes
+    ----------
+    chain : Chain
+        Of a `JointPosterior`.
+    diagnostics : Diagnostics
+        Of all frames together.
+    summary : astropy.table.Table
+        All parameters, as in `Result`; those that frames share come first.
+    shared : astropy.table.Table
+        The rows about what frames share, with `corner` and `corner_sd`.
+    frame_table : astropy.table.Table
+        A row for each frame: `frame`, its name; `time`, where shared parameters drift; `sources`;
+        `pixels` in the likelihood; `deviance_z`, in standard deviations of a true model's;
+        `fits_data`; `agreement_p`, the probability that a frame with the same shared parameters
+        differs as much from the others; `agrees`.
+    gain : str
+        One line: how much better the frames together know what they share.
+    path, page, picture, sources : Path
+        The files: the chain, the page of all frames, its picture, and one table of all sources.
+    frames : dict of str to Result
+        What there is of every frame. Its draws and its estimate are those of the joint posterior.
+    """
+
+    chain: Chain
+    diagnostics: Diagnostics
+    summary: Table
+    shared: Table
+    frame_table: Table
+    gain: str
+    path: Path
+    page: Path
+    picture: Path
+    sources: Path
+    frames: dict[str, Result]
 
 
 @dataclass(frozen=True, eq=False)

@@ -281,9 +281,25 @@ def toml_text(text: str) -> str:
 def _table(name: tuple[str, ...], table: dict[str, Any]) -> str:
     """A table of TOML with those in it; nothing for one without keys."""
     parts = {key: part for key, part in table.items() if isinstance(part, dict)}
-    lines = [f"{_key_text(k)} = {_value(v)}\n" for k, v in table.items() if k not in parts]
-    head = f"\n[{'.'.join(map(_key_text, name))}]\n" if name and lines else ""
-    return head + "".join(lines) + "".join(_table((*name, k), part) for k, part in parts.items())
+    many = {key: part for key, part in table.items() if _is_tables(part)}
+    keys = {key: value for key, value in table.items() if key not in {**parts, **many}}
+    head = f"\n[{'.'.join(map(_key_text, name))}]\n" if name and keys else ""
+    return "".join(
+        [
+            head,
+            _lines(keys),
+            *(_table((*name, key), part) for key, part in parts.items()),
+            *(f"\n[[{_key_text(key)}]]\n{_lines(e)}" for key, part in many.items() for e in part),
+        ]
+    )
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
+
+
+def _lines(table: dict[str, Any]) -> str:
+    return "".join(f"{_key_text(key)} = {_value(value)}\n" for key, value in table.items())
 
 
 def _key_text(key: str) -> str:
@@ -293,6 +309,9 @@ def _key_text(key: str) -> str:
 def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, dict):
+        inside = ", ".join(f"{_key_text(key)} = {_value(part)}" for key, part in value.items())
+        return f"{{ {inside} }}"
     if isinstance(value, str):  # JSON escapes as TOML does; it leaves what cannot be shown
         text = json.dumps(value, ensure_ascii=False)
         return "".join(c if c.isprintable() else _escape(ord(c)) for c in text)
@@ -341,7 +360,7 @@ def mistake(details: Any, root: type[Section], table: Any) -> str:
 def _known_keys(root: type[Section], location: tuple[str | int, ...], table: Any) -> list[str]:
     """The keys of the section at a location in the run file."""
     section: type[BaseModel] = root
-    for name in map(str, location):
+    for name in (str(part) for part in location if not isinstance(part, int)):
         if name in (*CLASSES, *DEFAULT_KINDS):
             section = model_of(name, table[name])
             continue

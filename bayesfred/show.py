@@ -11,17 +11,30 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.verify import Verification
 from bayesfred.errors import printable
+from bayesfred.io.summary_table import Table
 from bayesfred.proposal import Proposed
-from bayesfred.records import Calibrated, Compared, Corrected, Planned, Result, Simulated, Study
+from bayesfred.records import (
+    Calibrated,
+    Compared,
+    Corrected,
+    JointResult,
+    Planned,
+    Result,
+    Simulated,
+    Study,
+)
 from bayesfred.reporting import screen
 
+MOST_NAMED = 20  # parameters in a line
 
-def show_run(result: Result, *, as_json: bool = False) -> bool:
+
+def show_run(result: Result | JointResult, *, as_json: bool = False) -> bool:
     """Print what a run found; whether it is trustworthy is the last line, and what is returned.
 
     With `as_json` one JSON object is printed instead, see `run_record`.
@@ -31,33 +44,41 @@ def show_run(result: Result, *, as_json: bool = False) -> bool:
         print(json.dumps(run_record(result), allow_nan=False))
         return diagnostics.trustworthy
     console = _console()
-    console.print(screen.parameter_table(result.summary, console.width))
+    if isinstance(result, JointResult):
+        console.print(screen.parameter_table(result.shared, console.width))
+        console.print(screen.frame_table(result.frame_table, console.width))
+    else:
+        console.print(screen.parameter_table(result.summary, console.width))
     if chain.n_invalid:
         print(
             f"{chain.n_invalid} log-probabilities were NaN or infinite and taken as -inf: "
             "narrower priors avoid that"
         )
-    if diagnostics.prior_dominated:
+    if names := diagnostics.prior_dominated:
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         print(
-            f"prior-dominated: {', '.join(diagnostics.prior_dominated)}: the frame does not "
-            "decide alone, see the report"
+            f"prior-dominated: {', '.join(names[:MOST_NAMED])}{more}: the counts do not decide "
+            "alone, see the report"
         )
     _print_files(
         chain=result.path, report=result.page, picture=result.picture, sources=result.sources
     )
-    print(result.field.message)
-    if result.photons:
-        print(result.photons.message)
+    if isinstance(result, JointResult):
+        print(result.gain)
+    else:
+        print(result.field.message)
+        if result.photons:
+            print(result.photons.message)
     print(diagnostics.message)
     return diagnostics.trustworthy
 
 
-def run_record(result: Result) -> dict[str, Any]:
+def run_record(result: Result | JointResult) -> dict[str, Any]:
     """What a run found, as JSON can hold it: numbers that are not finite are None.
 
     Parameters
     ----------
-    result : Result
+    result : Result or JointResult
 
     Returns
     -------
@@ -66,28 +87,34 @@ def run_record(result: Result) -> dict[str, Any]:
         of the verdict; `modes`, the draws' shares in the posterior's modes if there are several;
         `causes`, a dict for each; `displacement`, the sentence; `parameters`, a
         dict for each row of the summary, by its columns; `files`, the paths of `chain`, `report`,
-        `picture` and `sources`.
+        `picture` and `sources`. Of several frames without `displacement`, and with `frames`, by
+        their names: such a dict of each, with its row of the table of frames.
     """
     diagnostics = result.diagnostics
     files = {
         "chain": result.path, "report": result.page, "picture": result.picture,
         "sources": result.sources,
     }  # fmt: skip
-    return {
+    record: dict[str, Any] = {
         **diagnostics.verdict,
         "causes": [asdict(cause) for cause in diagnostics.causes],
-        "displacement": result.field.message,
-        "parameters": [
-            {key: _plain(row[key]) for key in result.summary.colnames} for row in result.summary
-        ],
+        "parameters": _rows(result.summary),
         "files": {key: str(path) for key, path in files.items()},
     }
+    if isinstance(result, Result):
+        return record | {"displacement": result.field.message}
+    rows = zip(result.frames.values(), _rows(result.frame_table), strict=True)
+    return record | {"frames": {row.pop("frame"): run_record(own) | row for own, row in rows}}
 
 
-def _plain(value: Any) -> str | float | None:
-    """A table's text or number."""
-    if isinstance(value, str):
-        return str(value)
+def _rows(table: Table) -> list[dict[str, Any]]:
+    return [{key: _plain(row[key]) for key in table.colnames} for row in table]
+
+
+def _plain(value: Any) -> str | float | bool | None:
+    """A table's text, flag or number."""
+    if isinstance(value, str | np.bool_):
+        return value.item() if isinstance(value, np.bool_) else str(value)
     return float(value) if math.isfinite(value) else None
 
 

@@ -16,6 +16,7 @@ from bayesfred import settings
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError, printable
 from bayesfred.imaging.catalog import SourceCatalog
+from bayesfred.imaging.forward import require_image
 from bayesfred.imaging.psf import PSF
 from bayesfred.io.catalogues import SkyRecord, read_catalogue, read_sky_catalogue
 from bayesfred.io.frames import FrameRecord
@@ -70,7 +71,8 @@ def find_sources(
     InputError
         If the catalogue cannot be used, or the frame's pose is not found.
     """
-    c = run.catalogue
+    c, ny, nx = run.catalogue, *(run.detector.binning * side for side in shape)
+    require_image(psf.sigma, (ny, nx), f"{run_file}: ")
     if c.path is None:
         return _target(run, run_file, psf, frame)
     path = resolve(c.path, run_file, must_exist=True)

@@ -464,7 +464,7 @@ def test_what_is_finished_is_kept_when_workers_die(tmp_path: Path) -> None:
 
 
 def test_answers_say_what_is_lacking_or_failed() -> None:
-    assert executor.answer("unknown", None, 0)[1:] == (None, None)
+    assert executor.answer("unknown", None, 0)[1:3] == (None, None)
 
     class Broken:
         columns = ("x",)
@@ -477,7 +477,7 @@ def test_answers_say_what_is_lacking_or_failed() -> None:
 
     answer = executor.answer("broken", Broken(), 0)
     assert isinstance(answer, Answer)
-    assert answer[1:] == (None, "ValueError: two\\nlines")
+    assert answer[1:] == (None, "ValueError: two\\nlines", False)
 
 
 CLUSTER = """

@@ -523,6 +523,12 @@ def spoil_pixel(value: float) -> Prepare:
     return prepare
 
 
+def same_counts(value: float) -> Prepare:
+    """Give all pixels of the frame one value."""
+    counts = np.full((60, 75), value)
+    return lambda folder: frames.write_frame(folder / "frame.fits", counts, overwrite=True)
+
+
 def cut_frame(size: int) -> Prepare:
     """Keep the first bytes of the frame."""
     return lambda folder: (folder / "frame.fits").write_bytes(
@@ -707,7 +713,7 @@ REFUSALS = [
     Refusal(
         "output is the frame",
         both(frame_in_hdf5, sections(frame=IN_HDF5)),
-        ("run.toml", "output.path", "frame"),
+        ("got a file that is read",),
         OVERWRITE,
     ),
     Refusal("name too long", sections(output=f'path = "{"a" * 990}.h5"'), (".h5", "too long")),
@@ -761,6 +767,44 @@ DESCRIBED = [
     ),
     Refusal("term on the axis", sections(distortion=ON_AXIS), ("g_terms", "g_u2", "i + j >= 1")),
     Refusal("narrow PSF", sections(psf="sigma = 0.3"), ("psf", "sigma", "0.3", "impulse", "box")),
+    Refusal(
+        "narrow PSF to simulate",
+        sections(psf="sigma = 0.3"),
+        ("run.toml", "psf", "sigma", "0.3"),
+        SIMULATE,
+    ),
+    *(
+        Refusal(
+            f"wide PSF for {args[0]}", sections(psf=f"sigma = {width}"), ("psf: sigma", "75"), args
+        )
+        for width in ("1e6", "1e15")
+        for args in (("fit", "run.toml"), SIMULATE, ("study", "run.toml"))
+    ),
+    Refusal(
+        "more sources than the PSF separates",
+        content("stars.csv", "x,y,flux\n" + "".join(f"{k}e-9,0,1\n" for k in range(60_000))),
+        ("catalogue: got 1799970000 pairs", "360 GB of memory", "merge"),
+    ),
+    Refusal(
+        "more steps than memory holds",
+        sections(sampling="steps = 1000000000000000"),
+        ("sampling: got 4 ensembles of 32 walkers", "1000000000000000 steps", "GB of memory"),
+    ),
+    Refusal(
+        "more frames than memory holds",
+        sections(study="path = 's.ecsv'\nreplicates = 10000000\nflux = [1, 2, 3, 4, 5, 6, 7, 8]"),
+        ("study: got 80000000 frames, whose table", "GB of memory"),
+        ("study", "run.toml"),
+    ),
+    Refusal("dark frame", same_counts(0.0), ("counts: got 0 in each of 4500", "no information")),
+    Refusal(
+        "frame of one level", same_counts(100.0), ("counts: got 100 in each", "no information")
+    ),
+    Refusal(
+        "gain of nothing",
+        sections(frame='path = "frame.fits"\ngain = 1e-15'),
+        ("counts: got at most", "of 4500 pixels", "gain"),
+    ),
     Refusal(
         "prior of nothing",
         sections(**{"prior.f_zz": 'distribution = "norm"'}),

@@ -87,13 +87,16 @@ def test_settings_on_the_page_make_the_same_draws(finished: Path, tmp_path: Path
     np.testing.assert_array_equal(before.chain, after.chain)
 
 
-def test_settings_of_a_resumed_run_have_the_seed_of_its_beginning(
-    finished: Path, tmp_path: Path
-) -> None:
-    """They make the draws of the resumed run, whatever the changed run file says."""
+def test_settings_of_a_resumed_run_make_its_draws(finished: Path, tmp_path: Path) -> None:
+    """Those that cannot are refused, and change nothing."""
     folder = Path(shutil.copytree(finished, tmp_path / "here"))
-    changed = RUN.replace("seed = 7\nwalkers = 8\nsteps = 6", "seed = 8\nwalkers = 16\nsteps = 9")
-    (folder / "run.toml").write_text(changed)
+    before = (folder / "chains" / "run.h5").read_bytes()
+    (folder / "run.toml").write_text(RUN.replace("seed = 7\nwalkers = 8", "seed = 8\nwalkers = 16"))
+    code, said = invoke(folder, "fit", "run.toml", "--resume")
+    assert code == 2 and said.count("\n") == 1
+    assert "made with seed 7, walkers 8, got seed 8, walkers 16" in said
+    assert (folder / "chains" / "run.h5").read_bytes() == before
+    (folder / "run.toml").write_text(RUN.replace("steps = 6", "steps = 9"))
     assert invoke(folder, "fit", "run.toml", "--resume")[0] == 3
     (folder / "again.toml").write_text(settings_on(folder / "chains" / "run.html"))
     assert invoke(folder, "fit", "again.toml")[0] == 3
@@ -234,7 +237,7 @@ def test_runs_that_cannot_be_ranked_are_shown_side_by_side(two: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (("a.h5", "b.h5", "--out", "a.h5"), ("a.h5", "named as its report")),
+        (("a.h5", "b.h5", "--out", "a.h5"), ("a.h5", "expected NAME.html")),
         (("a.h5", "--out", "page.html"), ("got 1", "two models")),
         (("a.h5", "a.h5", "--out", "page.html"), ("a.h5", "twice")),
         (("a.h5", "absent.h5", "--out", "page.html"), ("absent.h5", "no such file")),

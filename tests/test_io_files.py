@@ -5,7 +5,8 @@ from __future__ import annotations
 import gzip
 import os
 import re
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,11 @@ from bayesfred.errors import InputError
 from bayesfred.io.atomic import replace
 from bayesfred.io.catalogues import CatalogueRecord, read_catalogue, write_catalogue
 from bayesfred.io.frames import read_frame, write_frame
+from bayesfred.io.lock import only_writer
 from bayesfred.io.paths import may_write
+from bayesfred.io.tables import read_table
+from bayesfred.sampling.chainfile import open_chain
+from bayesfred.settings import read_settings
 
 COUNTS = np.arange(35.0).reshape(5, 7)
 FRAME_SUFFIXES = [".fits", ".fit", ".FTS", ".fits.gz", ".fits.fz", ".h5", ".hdf5", ".npy"]
@@ -251,7 +256,7 @@ def test_frames_larger_than_memory_are_refused_unread(tmp_path: Path, suffix: st
         re.search(r"got 1000000 x 1000000 pixels, whose fit would need about (\S+) GB", text)[1]
     )  # type: ignore[index]
     assert need == pytest.approx(1e12 * (150 + 24 * (os.cpu_count() or 1)) / 1e9, rel=0.01)
-    assert text.endswith("GB of this machine: cut the frame or bin it")
+    assert text.endswith("GB that this process may take: cut the frame or bin it")
 
 
 def test_memory_is_asked_before_data_are_read(
@@ -361,6 +366,47 @@ def test_missing_files(tmp_path: Path) -> None:
 
 
 # Writing
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Makes pipes that nobody writes to; reading one ends the test."""
+
+    def make(name: str) -> Path:
+        os.mkfifo(tmp_path / name)
+        return tmp_path / name
+
+    def fail(*_: object) -> None:
+        raise AssertionError("waits for a pipe")
+
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(5)
+    yield make
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz", "a.fits.fz", "a.h5", "a.npy", "a.png"])
+def test_a_pipe_is_no_frame(pipe: Callable[[str], Path], name: str) -> None:
+    assert "not a file" in message(read_frame, pipe(name))
+
+
+def test_a_pipe_is_no_other_input(pipe: Callable[[str], Path]) -> None:
+    assert "not a file" in message(read_catalogue, pipe("stars.csv"))
+    assert "not a file" in message(read_table, pipe("table.ecsv"))
+    assert "not a file" in message(read_settings, pipe("run.toml"))
+    assert "no such file" in message(open_chain, pipe("run.h5"))
+
+
+def test_a_pipe_does_not_keep_a_second_writer_waiting(
+    pipe: Callable[[str], Path], tmp_path: Path
+) -> None:
+    with only_writer(tmp_path / "run.h5"):
+        (tmp_path / ".run.h5.writer").unlink()
+        pipe(".run.h5.writer")
+        said = pytest.raises(InputError, match="another process is writing this chain, expected")
+        with said, only_writer(tmp_path / "run.h5"):
+            pass
 
 
 def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
@@ -546,6 +592,56 @@ def test_catalogues_refused(tmp_path: Path, text: str, expected: str) -> None:
     got = message(read_catalogue, path)
     assert got.startswith(f"{path}: ")
     assert expected in got
+
+
+ECSV = """# %ECSV 1.0
+# ---
+# delimiter: ','
+# datatype:
+# - {name: x, datatype: float64}
+# - {name: y, datatype: float64}
+# - {name: flux, datatype: float64}
+# - {name: id, datatype: string}
+# schema: astropy-2.0
+"""
+
+
+@pytest.mark.parametrize("separator", [*"\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"])
+@pytest.mark.parametrize("suffix", [".csv", ".ecsv"])
+def test_only_line_ends_end_a_row(tmp_path: Path, separator: str, suffix: str) -> None:
+    """What follows such a character in a name was taken for a source of its own."""
+    text = f"x,y,flux,id\n2,3,4,A{separator}9,8,7,B\n".replace("9,8,7,B", '"9,8,7,B"')
+    quoted = f'x,y,flux,id\n2,3,4,"A{separator}9,8,7,B"\n'
+    for rows in (text.replace('"', ""), quoted):
+        path = csv(tmp_path, (ECSV if suffix == ".ecsv" else "") + rows, f"stars{suffix}")
+        if rows == quoted:
+            assert read_catalogue(path).x.tolist() == [2.0]
+        else:
+            assert "inconsistent with data columns (7)" in message(read_catalogue, path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_end_as_any_system_ends_them(tmp_path: Path, end: str) -> None:
+    path = csv(tmp_path, end.join(["x,y,flux", "1,2,3", "4,5,6", ""]))
+    assert read_catalogue(path).x.tolist() == [1.0, 4.0]
+
+
+@pytest.mark.parametrize("heading", ["x,y,flux,x", "x, y,flux, x ", "x,x,flux,y"])
+@pytest.mark.parametrize("suffix", [".csv", ".ecsv"])
+def test_columns_of_one_name_are_refused(tmp_path: Path, heading: str, suffix: str) -> None:
+    """The first was taken, and nothing said."""
+    text = f"{heading}\n1,2,3,4\n"
+    if suffix == ".ecsv":
+        names = [name.strip() for name in heading.split(",")]
+        kinds = [f"# - {{name: {name}, datatype: float64}}" for name in names]
+        text = "\n".join(["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:", *kinds,
+                          "# schema: astropy-2.0", text])  # fmt: skip
+    said = message(read_catalogue, csv(tmp_path, text, f"stars{suffix}"))
+    assert "got column 'x' 2 times, expected it once" in said
+
+
+def test_columns_of_one_name_that_are_not_used(tmp_path: Path) -> None:
+    assert read_catalogue(csv(tmp_path, "id,x,y,flux,id\na,1,2,3,b\n")).x.tolist() == [1.0]
 
 
 def test_catalogues_of_other_kinds(tmp_path: Path) -> None:

@@ -286,7 +286,7 @@ def deep_groups(file: h5py.File) -> None:
 
 
 @harm(
-    "of newer schema 8, expected bayesfred chain of schema 7: read it with the version that wrote "
+    "of newer schema 9, expected bayesfred chain of schema 8: read it with the version that wrote "
     "it"
 )
 def newer_schema(file: h5py.File) -> None:
@@ -294,7 +294,7 @@ def newer_schema(file: h5py.File) -> None:
     file["ensemble_0/unheard_of"] = ["text"]
 
 
-@harm("of schema 2, expected bayesfred chain of schema 7: remake it")
+@harm("of schema 2, expected bayesfred chain of schema 8: remake it")
 def older_schema(file: h5py.File) -> None:
     file.attrs["schema"] = 2
 

@@ -497,6 +497,13 @@ def test_footprint_keeps_pixels_near_sources(detector: Detector) -> None:
         ({"counts": np.full((60, 75), math.nan)}, "not finite"),
         ({"counts": np.full((60, 75), -1.0)}, "without read noise"),
         ({"model": make_model(SourceCatalog([400.0], [0.0], [1e3]))}, "all outside the frame"),
+        (
+            {
+                "model": make_model(SourceCatalog(*np.random.default_rng(1).random((3, 4501)))),
+                "nuisances": Nuisances("free"),
+            },
+            "got 4501 free fluxes in the frame and 4500 pixels",
+        ),
         ({"prior": {"f_nonsense": stats.norm()}}, "prior: got f_nonsense"),
         ({"prior": {"background": stats.beta(2, 2)}}, "background: got beta"),
         ({"prior": {"background": 3.0}}, "background: got float"),

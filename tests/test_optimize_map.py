@@ -319,6 +319,30 @@ def test_undetermined_parameters_are_named() -> None:
     assert find_map(Posterior(model, posterior.counts)).fits_data
 
 
+@pytest.mark.parametrize("flux", ["fixed", "scale", "free"])
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [(0.0, "got 0 in each of"), (100.0, "got 100 in each of"), (None, "got at most 1.4e-13 of")],
+)
+def test_a_frame_without_information_is_refused_at_once(
+    flux: Any, counts: float | None, said: str
+) -> None:
+    """Where the model's light is not in the frame, sampling went on for 100,000 steps."""
+    model = make_model()
+    frame = np.full(model.detector.shape, counts or 0.0)
+    if counts is None:
+        frame = 1e-15 * np.random.default_rng(1).poisson(90.0, frame.shape)
+    posterior = Posterior(model, frame, nuisances=Nuisances(flux))
+    with pytest.raises(InputError, match=f"counts: {said} .* holds no information"):
+        find_map(posterior)
+
+
+def test_a_frame_of_noise_is_not_one_without_information() -> None:
+    model = make_model()
+    frame = np.random.default_rng(2).poisson(0.5, model.detector.shape)
+    find_map(Posterior(model, frame))
+
+
 def test_a_narrow_prior_determines_a_parameter() -> None:
     model = make_model(tolerance=1e-8)
     posterior = Posterior(
@@ -395,4 +419,4 @@ def test_a_background_at_zero_gives_finite_numbers() -> None:
             ]
         )
     )
-    assert find_map(posterior).params[2] == 0.0
+    assert maximize(posterior, at).params[2] == 0.0

@@ -101,6 +101,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "versions": {"numpy": "2.0", "bayesfred": "0.1"},
         "draws": lambda: chain[:, 2:].reshape(-1, len(names)),
         "posterior": lambda: posterior,
+        "made_with": "bayesfred 0.1",
         "record": RunRecord("A frame", made="2026-11-22T04:00:17+00:00"),
     }
     return SimpleNamespace(**fields), posterior

@@ -19,6 +19,7 @@ import bayesfred as bf
 from bayesfred.analysis.comparison import Comparison, Score
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.analysis.extra_parameters import ExtraParameters
+from bayesfred.joint_pipeline import write_joint_results
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.sampling.record import RunRecord
@@ -35,7 +36,7 @@ CHROMIUM = next(
 if CHROMIUM is None:
     pytest.skip("needs Chromium: apt-get install chromium", allow_module_level=True)
 
-KINDS = ("green", "red", "thirty", "compared")
+KINDS = ("green", "red", "thirty", "compared", "joint")
 A4 = 703  # CSS pixels between margins of 12 mm
 LARGEST = 2_000_000  # bytes
 SETTINGS = "\n".join(f'[section_{k}]\nkey = "{"a long value " * 12}"' for k in range(9))
@@ -67,8 +68,13 @@ def contents(d: int) -> tuple[Any, Any, Any, Any]:
 
 
 def page(folder: Path, kind: str) -> Path:
-    """A green page with a truth, a red one with causes, one of thirty parameters, a comparison."""
+    """A green page with a truth, a red one with causes, one of thirty parameters, a comparison.
+
+    And the page of three frames, of which one shows another lens.
+    """
     folder.mkdir()
+    if kind == "joint":
+        return joint_page(folder)
     chain, diagnostics, truth, figures = contents(30 if kind == "thirty" else 5)
     if kind == "compared":
         found = diagnostics, found_with_causes(diagnostics)
@@ -86,6 +92,24 @@ def page(folder: Path, kind: str) -> Path:
         folder, chain=chain, diagnostics=diagnostics, figures=figures, truth=truth, result=sentence
     )
     return folder / "report.html"
+
+
+def joint_page(folder: Path) -> Path:
+    terms = [(1, 0, 0, 0), (2, 0, 0, 0), (1, 1, 0, 0), (0, 2, 0, 0)]
+    model = bf.ForwardModel(
+        bf.Detector((65, 65)), bf.SourceCatalog.grid(3, 20.0, 1e4), bf.GaussianPSF(2.0),
+        bf.PolynomialDistortion(terms, []),
+    )  # fmt: skip
+    frames = {
+        f"exposure_{k}_of_a_night_with_a_long_name": bf.Posterior(
+            model, bf.simulate(model, [0.0, 1e-4 + 1e-3 * (k == 2), 0.0, 0.0], 3.0, seed=k)
+        )
+        for k in range(3)
+    }
+    path = folder / "run.h5"
+    record = RunRecord("Night 3", "3 frames", SETTINGS, ("A note. " * 40, "path/" * 60))
+    chain = bf.laplace(bf.JointPosterior(frames), seed=1, path=path, progress=False, record=record)
+    return write_joint_results(chain, path, path, target_ess=100, overwrite=False).page
 
 
 @pytest.fixture(scope="module")

@@ -440,15 +440,53 @@ def test_another_state_of_the_random_numbers_is_seen(
     )
 
 
-def test_a_resumed_run_needs_neither_estimate_nor_the_same_settings(
-    posterior: Posterior, whole: Chain, tmp_path: Path
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"seed": 99}, "made with seed 1, got seed 99"),
+        ({"ensembles": 3}, "made with ensembles 2, got ensembles 3"),
+        ({"walkers": 10, "seed": 2}, "made with seed 1, walkers 8, got seed 2, walkers 10"),
+    ],
+)
+def test_other_numbers_than_those_of_the_run_are_refused(
+    posterior: Posterior, whole: Chain, tmp_path: Path, changed: dict[str, int], words: str
 ) -> None:
-    # the file's own seed, numbers and estimate hold
+    """They were ignored. The estimate is not needed: that in the file holds."""
     path = tmp_path / "chain.h5"
     run(posterior, whole.estimate, path, 5)
-    assert draws_of(
-        run(posterior, None, path, resume=True, seed=99, ensembles=3, walkers=10)
-    ) == draws_of(whole)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=f"chain.h5: the run was {words}, expected the same"):
+        run(posterior, None, path, resume=True, **changed)
+    assert path.read_bytes() == before
+    assert draws_of(run(posterior, None, path, resume=True)) == draws_of(whole)
+
+
+def test_the_versions_of_every_step_are_kept(
+    posterior: Posterior, whole: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They used to become today's, those of the steps made before too."""
+    path, first = tmp_path / "chain.h5", whole.versions
+    run(posterior, whole.estimate, path, 3)
+    other, another = {**first, "numpy": "9.9"}, {**first, "numpy": "10.0", "wheel": "1"}
+    for total, here in ((3, other), (5, other), (7, other), (TOTAL, another), (TOTAL, first)):
+        monkeypatch.setattr("bayesfred.sampling.sampler.versions", lambda here=here: here)
+        made = run(posterior, None, path, total, resume=True)
+        found = open_chain(path)
+        for chain in (made, found):
+            assert chain.versions == (here if total > 3 and here != first else chain.versions)
+    assert (found.versions, found.earlier) == (another, ((3, first), (7, other)))
+    assert draws_of(found) == draws_of(whole)
+    numpy = f"until step 3 numpy {first['numpy']}; until step 3 wheel not there"
+    assert found.made_with.endswith(
+        f"wheel 1; {numpy}; until step 7 numpy 9.9; until step 7 wheel not there"
+    )
+    write_chain(found)
+    assert open_chain(path).earlier == found.earlier
+    with h5py.File(path, "a") as file:
+        file["versions"].move("until_7", f"until_{TOTAL}")
+    reseal(path)
+    with pytest.raises(InputError, match="versions of steps that there are not"):
+        open_chain(path)
 
 
 def test_steps_is_a_total(

@@ -16,6 +16,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.io.paths import resolve, within
 from bayesfred.io.serialize import kinds, serializable
+from bayesfred.joint_settings import DriftSettings, JointSettings
 from bayesfred.sections import model_of
 from bayesfred.settings import PriorSettings, RunSettings, read_settings
 
@@ -97,6 +98,10 @@ def test_example_names_every_key(tmp_path: Path) -> None:
     lines = EXAMPLE.splitlines()
     text = "\n".join(re.sub(r"^# (?=\w+ = |\[)", "", line) for line in lines)
     table = tomllib.loads(text)
+    (entry,), joint = table.pop("frames"), table.pop("joint")
+    assert set(joint) == set(JointSettings.model_fields)
+    assert set(joint["drift"]) == set(DriftSettings.model_fields)
+    assert set(entry) == {"name", "time", "path", "catalogue"}  # the others are named above
     assert set(table) == set(RunSettings.model_fields)
     for name, field in RunSettings.model_fields.items():
         if name in ("psf", "noise"):  # the keys of every kind
@@ -111,6 +116,7 @@ def test_example_names_every_key(tmp_path: Path) -> None:
         assert name == "prior" or set(table[name]) == keys
     # All of them at once, but for the keys that exclude others, are a run file.
     path = tmp_path / "run.toml"
+    text = text[: text.index("[joint]")]
     path.write_text(
         re.sub(
             r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling|variance|rows|columns|pitch|layout|marks)"
@@ -482,9 +488,9 @@ def test_text_that_is_not_a_run_file(tmp_path: Path, text: str, expected: str) -
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no\.toml: no such file, expected a run file"):
+    with pytest.raises(InputError, match=r"no\.toml: no such file, expected one to read"):
         read_settings(tmp_path / "no.toml")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="not a file, expected one to read"):
         read_settings(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
     with pytest.raises(InputError, match=r"latin\.toml: not TOML \('utf-8' codec"):

@@ -1,4 +1,4 @@
-"""Which model of a frame predicts sources best that it has not seen, and which is more probable.
+"""Which model of frames predicts sources best that it has not seen, and which is more probable.
 
 Pixels of one star share its errors: its position, its flux, the PSF there. A model that fits these
 with needless terms predicts every single pixel better from the others of the same star, and the
@@ -11,7 +11,8 @@ from the others, R:
 Z the evidence, the integral of likelihood times prior. Z(F, R) is that of the chain, by bridge
 sampling, and Z(R) that of a fit without the fold, by importance sampling from its own proposal
 (`evidence`). Free fluxes and shifts of the sources are integrated out of the likelihoods, those of
-the sources in F too. What a prior is multiplied with cancels.
+the sources in F too. What a prior is multiplied with cancels. A source that several frames show is
+left out of all of them (`joint_folds`).
 
 A model is scored by elpd, the sum over folds, and differences are judged by the scatter of the
 folds' differences. The weights of stacking are those of the mixture of all models that predicts the
@@ -36,6 +37,7 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
+from bayesfred.analysis.comparable import comparable_posteriors, require_sampled
 from bayesfred.analysis.evidence import (
     Evidence,
     importance_evidence,
@@ -43,16 +45,18 @@ from bayesfred.analysis.evidence import (
     random_numbers,
 )
 from bayesfred.analysis.extra_parameters import ExtraParameters, contained, judge_extra
-from bayesfred.analysis.folds import Folds, fold_sources, require_sources
-from bayesfred.analysis.verdict import MIN_EFFICIENCY, judge_approximation, judge_sampling
+from bayesfred.analysis.folds import FEWEST
+from bayesfred.analysis.joint_folds import (
+    AnyPosterior,
+    FrameFolds,
+    fold_frames,
+    frame_views,
+    require_visible,
+)
 from bayesfred.errors import InputError
-from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.chain import Chain
-from bayesfred.sampling.convergence import convergence
-from bayesfred.sampling.displacement import frame_posterior
-from bayesfred.sampling.laplace import importance_efficiency
 
 __all__ = ["Comparison", "Score", "compare"]
 
@@ -111,7 +115,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Models of one frame, ranked by predictive accuracy.
+    """Models of the same frame or frames, ranked by predictive accuracy.
 
     Attributes
     ----------
@@ -121,8 +125,9 @@ class Comparison:
         The model with the fewest parameters among those that predict as well as the best: whose
         elpd is less than 4, or less than twice the difference's standard error, below the best
         one's. Of few folds K it is not twice, but the quantile of Student's distribution.
-    folds : tuple of tuple of int
-        The sources of each fold, as numbered in the catalogue from 0.
+    folds : tuple of tuple of int or str
+        The sources of each fold, as numbered in the catalogue from 0; of several frames with the
+        frame's name, such as `a.3`.
     extra : mapping of (str, str) to ExtraParameters
         By the names of a leaner and a larger model that contains it, whether the parameters that
         only the larger one has are real.
@@ -130,7 +135,7 @@ class Comparison:
 
     scores: tuple[Score, ...]
     chosen: str
-    folds: tuple[tuple[int, ...], ...]
+    folds: tuple[tuple[int | str, ...], ...]
     extra: Mapping[tuple[str, str], ExtraParameters]
 
     @property
@@ -173,7 +178,7 @@ class _Fitted(NamedTuple):
     """A model fitted to the frame, and to the frame without each fold."""
 
     chain: Chain
-    posterior: Posterior
+    posterior: AnyPosterior
     evidence: Evidence
     by_fold: Floats  # (K,) log predictive density of each fold
     error: float  # of their sum, from the draws
@@ -183,12 +188,13 @@ class _Fitted(NamedTuple):
 
 
 def compare(chains: Mapping[str, Chain]) -> Comparison:
-    """Compare models of one frame by how well they predict sources that are left out.
+    """Compare models of the same counts by how well they predict sources that are left out.
 
     Parameters
     ----------
     chains : mapping of str to Chain
-        Chains of the same counts and mask, sampled well, by the names to call their models.
+        Chains of one frame, or all of the same frames, with the same counts and masks, sampled
+        well, by the names to call their models.
 
     Returns
     -------
@@ -197,9 +203,9 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
     Raises
     ------
     InputError
-        If there are fewer than two chains, one is not of a frame, not sampled well or has several
-        modes, their counts or masks differ, or some give probabilities of integer counts and others
-        densities; if fewer than three sources have their image in the frame.
+        If there are fewer than two chains, one is not of frames, not sampled well or has several
+        modes, their frames, counts or masks differ, or some give probabilities of integer counts
+        and others densities; if fewer than three sources have their image in a frame.
 
     Notes
     -----
@@ -226,15 +232,14 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
         raise InputError(
             f"chains: got {len(chains)}, expected at least two models of one frame to compare"
         )
-    posteriors = {name: _posterior(name, chain) for name, chain in chains.items()}
-    _require_comparable(posteriors)
+    posteriors = comparable_posteriors(chains)
     for name, chain in chains.items():
-        _require_sampled(name, chain)
+        require_sampled(name, chain)
     with threadpool_limits(1, user_api="blas"):
         evidence = {name: log_evidence(chain) for name, chain in chains.items()}
         likely = max(chains, key=lambda name: evidence[name].log_evidence)
-        folds = fold_sources(posteriors[likely], chains[likely].estimate.params, FOLDS)
-        require_sources(folds)
+        folds = fold_frames(posteriors[likely], chains[likely].estimate.params, FOLDS)
+        require_visible(folds, FEWEST, "to predict some from the others")
         fitted = {
             name: _left_out(chain, posteriors[name], evidence[name], folds)
             for name, chain in chains.items()
@@ -246,61 +251,14 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
     return Comparison(
         scores,
         min(good, key=lambda s: s.n_parameters).name,
-        tuple(
-            tuple(np.flatnonzero(folds.sources == k).tolist())
-            for k in range(int(folds.sources.max()) + 1)
-        ),
+        folds.members,
         _extra(fitted),
     )
 
 
-def _posterior(name: str, chain: Chain) -> Posterior:
-    try:
-        return frame_posterior(chain)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
-
-
-def _require_comparable(posteriors: Mapping[str, Posterior]) -> None:
-    first, *others = posteriors
-    for name in others:
-        one, other = posteriors[first], posteriors[name]
-        for what in ("counts", "mask"):
-            if not np.array_equal(getattr(one, what), getattr(other, what)):
-                raise InputError(
-                    f"{name}: {what}: got others than those of {first}, expected models of the "
-                    "same frame and pixels"
-                )
-        if one.noise.discrete != other.noise.discrete:
-            discrete, density = (first, name) if one.noise.discrete else (name, first)
-            raise InputError(
-                f"{density}: noise: got a density, and probabilities of integer counts for "
-                f"{discrete}, expected noise models of one kind: fit both with read noise, or "
-                "both without"
-            )
-
-
-def _require_sampled(name: str, chain: Chain) -> None:
-    if chain.estimate.modes is not None:  # each would need a refit without every fold
-        raise InputError(
-            f"{name}: got a posterior of several modes, expected one: narrow the priors"
-        )
-    if chain.method == "mcmc":
-        rhat, *ess = convergence(chain.chain[:, chain.burn_in :])
-        acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
-        well, said = judge_sampling(chain, rhat, np.minimum(*ess), acceptance, chain.target_ess, "")
-    else:
-        efficiency = importance_efficiency(chain)
-        well = efficiency >= MIN_EFFICIENCY and chain.estimate.at_maximum
-        said = judge_approximation(chain, efficiency)
-    if not well:
-        raise InputError(
-            f"{name}: got draws that do not represent the posterior, expected a well sampled "
-            f"chain: {said}"
-        )
-
-
-def _left_out(chain: Chain, posterior: Posterior, evidence: Evidence, folds: Folds) -> _Fitted:
+def _left_out(
+    chain: Chain, posterior: AnyPosterior, evidence: Evidence, folds: FrameFolds
+) -> _Fitted:
     """Leave out fold after fold."""
     random, start = random_numbers(chain), chain.estimate.params
     found, shapes, gradients, params = [], [], [], []
@@ -334,8 +292,7 @@ def _scores(fitted: Mapping[str, _Fitted], weights: Mapping[str, float]) -> tupl
         scores.append(
             Score(
                 name,
-                fit.posterior.n_parameters
-                + fit.posterior.nuisances.profiled * len(fit.posterior.model.sources),
+                _count_free(fit.posterior),
                 float(fit.by_fold.sum()),
                 math.hypot(_error_of_sum(fit.by_fold), fit.error),
                 float(behind.sum()),
@@ -348,6 +305,13 @@ def _scores(fitted: Mapping[str, _Fitted], weights: Mapping[str, float]) -> tupl
             )
         )
     return tuple(scores)
+
+
+def _count_free(posterior: AnyPosterior) -> int:
+    """Parameters, and every source's flux and shifts where these are free."""
+    frames = [view.posterior for view in frame_views(posterior)]
+    profiled = sum(frame.nuisances.profiled * len(frame.model.sources) for frame in frames)
+    return posterior.n_parameters + profiled
 
 
 def _error_of_sum(values: Floats) -> float:

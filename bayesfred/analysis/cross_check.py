@@ -1,4 +1,4 @@
-r"""Whether a frame's errors are right, asked of the frame itself: two halves, fitted apart.
+r"""Whether errors are right, asked of the frames themselves: two halves, fitted apart.
 
 The sources are split into halves that each cover the field (`folds`). Each half's likelihood l_i
 has pixels of its own, so its estimate t_i has the covariance I_i^-1, I_i the Fisher information,
@@ -33,39 +33,61 @@ degrees of freedom are the number of the others. The displacement field is a lin
 coefficients. Of its principal components, those that make up 99 % of the mean square difference
 expected over the field are kept.
 
+Several frames. Each half has half of the sources of every frame (`joint_folds`), and t_i has the
+parameters of all frames. A source that several frames show is in one half. The frames are taken as
+independent, and where they are not, because they have the errors of one catalogue in common, the
+halves differ by more than the errors of what the frames share. So the coefficients that are
+compared are the shared ones, among which a single frame's would be lost. The displacement field is
+that of all frames, with their own coefficients.
+
 References
 ----------
 B. Efron & C. Stein (1981), Annals of Statistics 9, 586: variance from halves.
 A. Gelman, X.-L. Meng, H. Stern (1996), Statistica Sinica 6, 733: checks of a model on its own data.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import linalg, stats
 from threadpoolctl import threadpool_limits
 
-from bayesfred._typing import Flags, Floats, Ints
+from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.agreement import Agreement, Verdict
-from bayesfred.analysis.folds import Folds, fold_sources
-from bayesfred.analysis.sources import source_table
+from bayesfred.analysis.halves import (
+    coefficients,
+    difference,
+    displacements,
+    fit_half,
+    predicted,
+)
+from bayesfred.analysis.held_scatter import hold_scatter
+from bayesfred.analysis.joint_folds import AnyPosterior, fold_frames, require_visible
 from bayesfred.errors import InputError
-from bayesfred.model.kernels.clusters import DOF
-from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.estimate import MapEstimate, inverse
-from bayesfred.optimize.find_map import CLOSENESS, find_map
-from bayesfred.optimize.newton import maximize
-from bayesfred.sampling.moves import LaplaceMove
+from bayesfred.model.joint import JointPosterior
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.find_map import find_map
 
-__all__ = ["CrossCheck", "cross_check"]
+__all__ = ["CrossCheck", "FrameCheck", "cross_check"]
 
-KNOWN = 0.5  # share of what is known of a direction that the frame has to say
-SINGULAR = 1e-13  # eigenvalues of scaled information below this share of the largest are rounding
-HELD = 1e-4  # relative standard deviation of a parameter that is held
-FIELD = 0.99  # share of the field's expected mean square difference to be tested
+MOST_NAMED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCheck:
+    """What the halves of several frames say about the errors in one of them.
+
+    Attributes
+    ----------
+    displacement : Agreement
+        Of the displacement field over the frame.
+    positions : tuple of Agreement
+        Of the image positions found in each half with the predicted ones.
+    """
+
+    displacement: Agreement
+    positions: tuple[Agreement, Agreement]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +97,9 @@ class CrossCheck:
     Attributes
     ----------
     displacement : Agreement
-        Of the displacement field over the frame.
+        Of the displacement field over the frame, or over all frames.
     coefficients : Agreement
-        Of the distortion's coefficients and the pointing.
+        Of the distortion's coefficients and the pointing; of several frames, of those they share.
     positions : tuple of Agreement
         Of the image positions found in each half with those that the other half's fit predicts;
         `factor` is the weighted root mean square of the differences in standard deviations.
@@ -85,9 +107,12 @@ class CrossCheck:
         Root mean square difference of the halves' displacements over the field along each axis, and
         what it is expected to be if the errors are right.
     sources : ndarray of int, shape (n,)
-        Half of each source, 0 or 1; -1 where the frame does not hold its image.
+        Half of each source, 0 or 1; -1 where the frame does not hold its image. The sources of
+        several frames stand one frame after the other.
     params : ndarray, shape (2, d)
         Maximum of each half.
+    frames : mapping of str to FrameCheck
+        What the halves say of each of several frames.
     """
 
     displacement: Agreement
@@ -97,6 +122,7 @@ class CrossCheck:
     displacement_expected: float
     sources: Ints
     params: Floats
+    frames: Mapping[str, FrameCheck] = field(default_factory=dict)
 
     @property
     def displacement_p(self) -> float:
@@ -142,14 +168,24 @@ class CrossCheck:
         found = f"{of}: chi-square {a.chi2:.1f} for {a.dof} degrees of freedom, p = {a.p:.2g}"
         if self.holds:
             return f"the errors are right: the halves agree ({found}); {power}"
-        return f"the errors are {self.verdict}: {scaling}; {found}; {power}"
+        return f"the errors are {self.verdict}: {scaling}; {found}{self._by_frame}; {power}"
+
+    @property
+    def _by_frame(self) -> str:
+        """Which frames show it alone."""
+        alike = [k for k, own in self.frames.items() if own.displacement.verdict == self.verdict]
+        if not alike:
+            return "; no frame shows it alone" if self.frames else ""
+        named = ", ".join(alike[:MOST_NAMED]) + (", ..." if len(alike) > MOST_NAMED else "")
+        return f"; {len(alike)} of {len(self.frames)} frames show it alone ({named})"
 
     def record(self) -> dict[str, Any]:
         """The findings as numbers and texts by name, as `bayesfred crosscheck --json` prints them.
 
         Each agreement has `p`, `chi2`, `dof`, `factor`, `factor_low`, `factor_high` and
         `detectable`; of the positions in each half there is the root mean square in standard
-        deviations.
+        deviations. Of several frames, `frames` has by name `displacement_p`, `displacement_factor`
+        and `positions_rms_z`.
         """
         record: dict[str, Any] = {"verdict": self.verdict, "message": self.message}
         for name, a in (("displacement", self.displacement), ("coefficients", self.coefficients)):
@@ -162,27 +198,28 @@ class CrossCheck:
         record["positions_rms_z"] = [a.factor for a in self.positions]
         record["displacement_rms"] = self.displacement_rms
         record["displacement_expected"] = self.displacement_expected
+        if self.frames:
+            record["frames"] = {
+                name: {
+                    "displacement_p": own.displacement.p,
+                    "displacement_factor": own.displacement.factor,
+                    "positions_rms_z": [a.factor for a in own.positions],
+                }
+                for name, own in self.frames.items()
+            }
         return record
 
 
-class _Half(NamedTuple):
-    """The likelihood of a half near its maximum."""
-
-    params: Floats  # (d,)
-    information: Floats  # (d, d)
-    estimate: Floats  # (d,) I t, for t measured from the whole frame's maximum
-
-
-def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) -> CrossCheck:
+def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None) -> CrossCheck:
     """Fit two halves of the sources apart and ask whether they agree within their errors.
 
     The halves are a checkerboard over the field. Each has the pixels of its own sources, so that
     their counts are independent; every source stays in both models, as its light reaches the
-    other half's pixels.
+    other half's pixels. Of several frames each half has one half of every frame.
 
     Parameters
     ----------
-    posterior : Posterior
+    posterior : Posterior or JointPosterior
     estimate : MapEstimate, optional
         Its maximum; found if not given.
 
@@ -193,17 +230,18 @@ def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) ->
     Raises
     ------
     InputError
-        If fewer than two sources have their image in the frame, no coefficient is known by both
+        If fewer than two sources have their image in a frame, no coefficient is known by both
         halves, or a half's maximum is not found.
 
     Notes
     -----
-    It tests the errors of one frame: what both halves have in common, such as a wrong PSF that
-    moves all images alike, a wrong plate scale of the catalogue or a field that no term describes,
-    it does not see. Errors of the linear approximation are neglected. The verdict is "right" where
-    both probabilities lie between 0.01 and 0.99. With `position_scatter` the scatter is estimated
-    from the same sources: with n sources and k degrees of freedom chi-square varies less, by a
-    factor of about 1 - k / 2n in the variance.
+    What both halves have in common, such as a wrong PSF that moves all images alike, a wrong plate
+    scale of the catalogue, a field that no term describes or a frame of another instrument, it does
+    not see: `diagnose` tells whether frames agree about what they share. Errors of the linear
+    approximation are neglected. The verdict is "right" where both probabilities lie between 0.01
+    and 0.99. With `position_scatter` the scatter is estimated from the same sources: with n sources
+    and k degrees of freedom chi-square varies less, by a factor of about 1 - k / 2n in the
+    variance.
 
     Examples
     --------
@@ -218,156 +256,35 @@ def cross_check(posterior: Posterior, *, estimate: MapEstimate | None = None) ->
     """
     with threadpool_limits(1, user_api="blas"):
         whole = estimate or find_map(posterior)
-        folds = fold_sources(posterior, whole.params, 2)
-        n_sources = int(np.sum(folds.sources >= 0))
-        if n_sources < 2:
-            raise InputError(
-                f"catalogue: got {n_sources} sources with an image in the frame, expected at least "
-                "2 to make halves of: check positions and mask"
-            )
-        fixed, start = _scatter_fixed(posterior, whole)
-        one, two = (_fitted(fixed, folds, k, start) for k in (0, 1))
-        z, directions = _difference(fixed, (one, two), start)
+        folds = fold_frames(posterior, whole.params, 2)
+        require_visible(folds, 2, "to make halves of")
+        fixed, start = hold_scatter(posterior, whole)
+        one, two = (fit_half(fixed, folds, k, start) for k in (0, 1))
+        moving = coefficients(fixed)
+        z, directions = difference(fixed, (one, two), start, moving)
         if not z.size:
             raise InputError(
-                f"catalogue: got {n_sources} sources, half of which determine no coefficient, "
-                "expected more: fit fewer terms"
+                f"catalogue: got {np.sum(folds.sources >= 0)} sources, half of which determine no "
+                "coefficient, expected more: fit fewer terms"
             )
-        field = _field(posterior, whole.params, folds.points) @ directions
-        _, spread, components = np.linalg.svd(field / np.sqrt(len(field)), full_matrices=False)
-        share = np.cumsum(spread**2) / np.sum(spread**2)
-        kept = components[: int(np.searchsorted(share, FIELD)) + 1]
+        lens = z
+        if isinstance(posterior, JointPosterior) and moving[: posterior.n_shared].any():
+            moving[posterior.n_shared :] = False
+            lens = difference(fixed, (one, two), start, moving)[0]
+        whole_field, fields = displacements(posterior, whole.params, folds, z, directions)
+        positions = [predicted(fixed, folds, k, other) for k, other in enumerate((two, one))]
+        frames = {
+            name: FrameCheck(own.agreement, (positions[0][1][name], positions[1][1][name]))
+            for name, own in fields.items()
+            if name
+        }
         return CrossCheck(
-            displacement=Agreement.of(kept @ z),
-            coefficients=Agreement.of(z),
-            positions=(
-                _predicted(folds.only(fixed, 0), two, folds.sources == 0),
-                _predicted(folds.only(fixed, 1), one, folds.sources == 1),
-            ),
-            displacement_rms=float(np.sqrt(np.mean((field @ z) ** 2))),
-            displacement_expected=float(np.sqrt(np.sum(spread**2))),
+            displacement=whole_field.agreement,
+            coefficients=Agreement.of(lens if lens.size else z),
+            positions=(positions[0][0], positions[1][0]),
+            displacement_rms=whole_field.rms,
+            displacement_expected=whole_field.expected,
             sources=folds.sources,
             params=np.array([one.params, two.params]),
+            frames=frames,
         )
-
-
-def _scatter_fixed(posterior: Posterior, whole: MapEstimate) -> tuple[Posterior, Floats]:
-    """The posterior with the scatter of positions, if any, held, and its parameters so."""
-    if not posterior.hyperparameters:
-        return posterior, whole.params
-    (name,) = posterior.hyperparameters
-    k = posterior.parameter_names.index(name)
-    nested = LaplaceMove.of(posterior, whole)
-    values = nested.means[:, int(np.argmax(nested.order == k))]
-    value = float(nested.weights @ values**-2.0) ** -0.5
-    start = whole.params.copy()
-    start[k] = value
-    held = {**posterior.prior, name: stats.norm(value, HELD * value)}
-    return replace(posterior, prior=held, extrapolation=None), start
-
-
-def _fitted(posterior: Posterior, folds: Folds, fold: int, start: Floats) -> _Half:
-    """The likelihood of one half near its maximum."""
-    half = folds.only(posterior, fold)
-    top = maximize(half, start)
-    if not top.distance < CLOSENESS:
-        raise InputError(
-            f"half {fold + 1}: no maximum found from that of the whole frame, expected "
-            f"{int(np.sum(folds.sources == fold))} sources to determine the parameters: fit fewer "
-            "terms, or use more sources"
-        )
-    information = half.fisher(top.params)
-    pull = half.likelihood.gradient(top.params)
-    return _Half(top.params, information, information @ (top.params - start) + pull)
-
-
-def _difference(
-    posterior: Posterior, halves: Sequence[_Half], start: Floats
-) -> tuple[Floats, Floats]:
-    """The halves' difference in its independent directions that the data know.
-
-    Returns
-    -------
-    z : ndarray, shape (k,)
-        Along each direction, in standard deviations.
-    directions : ndarray, shape (m, k), parameter units
-        What one standard deviation along each is of the m coefficients.
-    """
-    names = np.array(posterior.parameter_names)
-    free = ~np.isin(names, posterior.hyperparameters)
-    prior = posterior.prior_information(start)
-    scale = 1.0 / np.sqrt(np.diag(sum((half.information for half in halves), prior)))[free]
-    prior, one, two = (
-        matrix[np.ix_(free, free)] * np.outer(scale, scale)
-        for matrix in (prior, *(half.information for half in halves))
-    )
-    first, second = (half.estimate[free] * scale for half in halves)
-    both = np.linalg.pinv(one + two, rcond=SINGULAR, hermitian=True)
-    known = one @ both @ two
-    known, pull = 0.5 * (known + known.T), two @ both @ first - one @ both @ second
-    wanted = np.flatnonzero(_are_coefficients(posterior, names[free]))
-    others = np.setdiff1d(np.arange(free.sum()), wanted)
-    inner = np.linalg.pinv(known[np.ix_(others, others)], rcond=SINGULAR, hermitian=True)
-    through = known[np.ix_(wanted, others)] @ inner
-    known = known[np.ix_(wanted, wanted)] - through @ known[np.ix_(others, wanted)]
-    pull = pull[wanted] - through @ pull[others]
-    values, vectors = np.linalg.eigh(known + prior[np.ix_(wanted, wanted)])
-    usable = values > SINGULAR * values[-1]
-    whiten = vectors[:, usable] / np.sqrt(values[usable])
-    share, axes = np.linalg.eigh(whiten.T @ known @ whiten)
-    axes, share = (whiten @ axes)[:, share > KNOWN], share[share > KNOWN]
-    return axes.T @ pull / np.sqrt(share), scale[wanted, None] * axes / np.sqrt(share)
-
-
-def _are_coefficients(posterior: Posterior, names: NDArray[np.str_]) -> Flags:
-    """Which parameters move images: the distortion's terms and the pointing."""
-    terms = (*posterior.model.distortion.names, "offset_x", "offset_y")
-    return np.isin(names, terms)
-
-
-def _predicted(half: Posterior, other: _Half, sources: Flags) -> Agreement:
-    """How well the other half's fit predicts where this half's sources are found.
-
-    The positions' errors are those of each source's counts, and of its place in the catalogue where
-    positions scatter. They are independent of the prediction's, which all sources share.
-    """
-    named = dict(zip(half.parameter_names, other.params, strict=True))
-    table, step = source_table(half, other.params)[sources], half.model.detector.binning
-    u, v, du, dv, du_sd, dv_sd = (
-        np.array(table[name]) * step for name in ("u", "v", "du", "dv", "du_sd", "dv_sd")
-    )
-    found = np.isfinite(u + v + du + dv)
-    if not found.any():
-        return Agreement.of(np.empty(0))
-    free = ~np.isin(half.parameter_names, half.hyperparameters)
-    names = np.array(half.parameter_names)[free]
-    information = other.information + half.prior_information(other.params)
-    wanted = _are_coefficients(half, names)
-    covariance = inverse(information[np.ix_(free, free)])[np.ix_(wanted, wanted)]
-    field = _field(half, other.params, np.column_stack([u, v])[found])
-    errors = np.concatenate([du_sd[found], dv_sd[found]]) ** 2
-    tau = named.get("position_scatter", 0.0)
-    square = np.tile((du[found] ** 2 + dv[found] ** 2) / DOF, 2)
-    errors += (tau**2 + square) * DOF / (DOF + 2.0) if tau else 0.0
-    lower = linalg.cholesky(field @ covariance @ field.T + np.diag(errors), lower=True)
-    away = np.concatenate([du[found], dv[found]])
-    return Agreement.of(linalg.solve_triangular(lower, away, lower=True))
-
-
-def _field(posterior: Posterior, params: Floats, points: Floats) -> Floats:
-    """Displacement of images by a unit of each coefficient, to first order in the distortion.
-
-    Returns
-    -------
-    ndarray, shape (2 n, m), pixel per unit of the coefficient
-        Along u at every point, then along v.
-    """
-    d = posterior.model.polynomial
-    known = dict(zip(posterior.parameter_names, params, strict=True))
-    u, v = points.T - np.array([[known.get(name, 0.0)] for name in ("offset_x", "offset_y")])
-    x, y = d.object_position(params[: d.n_terms], u, v)
-    columns = [-d.design_matrix(u, v, x, y)]
-    if posterior.nuisances.offset:
-        columns.append(np.repeat(np.eye(2)[:, None, :], len(points), axis=1))
-    field = np.concatenate(columns, axis=2)
-    return np.asarray(field[:, np.isfinite(x + y)].reshape(-1, field.shape[2]))

@@ -17,6 +17,7 @@ A. Sokal (1996), Monte Carlo methods in statistical mechanics: the window of the
 time.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +26,8 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.analysis.causes import Cause
 from bayesfred.analysis.checks import check_table, sums
+from bayesfred.analysis.frame_agreement import FrameAgreement, frame_agreement
+from bayesfred.analysis.frame_verdict import frame_sensitivities, judge_frames, total_fit
 from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_checks
 from bayesfred.analysis.robust import robust_sd
 from bayesfred.analysis.sensitivity import sensitivities
@@ -35,7 +38,8 @@ from bayesfred.analysis.verdict import (
     judge_sampling,
     mode_shares,
 )
-from bayesfred.io.summary_table import Table, make_table
+from bayesfred.io.summary_table import Table, make_table, stacked
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chain import Chain
@@ -109,7 +113,8 @@ class Diagnostics:
         the frame is at least 0.05 too.
     robust_sd : dict of str to float
         Where the model does not fit: standard deviations that follow from the scatter between
-        sources, by parameter, see `bayesfred.analysis.robust`. Empty where it fits.
+        sources, by parameter, see `bayesfred.analysis.robust`. Empty where it fits, and of a frame
+        among several.
     residuals : Residuals or None
         The table of sources, and what the residuals show; None for a density that is not a
         `Posterior` of a frame.
@@ -117,7 +122,12 @@ class Diagnostics:
         A row for each check of the fit, with the columns name, value, expected, sd, z and meaning:
         the two sums above, the scores of what is not fitted, the source that is farthest off in
         each way, the randomised PIT, the whiteness of the residuals, displacement against pixel
-        phase, and the posterior predictive draws that were asked for.
+        phase, and the posterior predictive draws that were asked for. Of several frames they are
+        the two sums, and the agreement of each.
+    frames : mapping of str to Diagnostics
+        Of several frames, what there is to say of each; empty of a single one.
+    agreement : FrameAgreement or None
+        Of several frames, whether they agree about what they share.
     """
 
     sampled_well: bool | None
@@ -149,10 +159,17 @@ class Diagnostics:
     robust_sd: dict[str, float]
     residuals: Residuals | None = field(repr=False, compare=False)
     checks: Table = field(repr=False, compare=False)
+    frames: Mapping[str, "Diagnostics"] = field(default_factory=dict, repr=False)
+    agreement: FrameAgreement | None = None
 
     @property
     def sources(self) -> Table:
-        """How well every source agrees with the counts, see `analysis.sources.source_table`."""
+        """How well every source agrees with the counts, see `analysis.sources.source_table`.
+
+        Of several frames there is a column `frame` before the others.
+        """
+        if self.frames:
+            return stacked({name: each.sources for name, each in self.frames.items()}, "frame")
         return make_table({}) if self.residuals is None else self.residuals.sources
 
     @property
@@ -231,7 +248,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     Parameters
     ----------
     chain : Chain
-        A finished or running chain, or one that `laplace` made.
+        A finished or running chain, or one that `laplace` made. Of several frames each is judged,
+        and whether they agree about what they share.
     target_ess : float, optional
         Effective draws demanded of every parameter.
     predictive : int, optional
@@ -247,17 +265,26 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     Sun and Zhou, the equations of lambda-hat and of the normalised chi-square, for
     `background_estimate` and `chi2_paper`. Kallioinen et al. (2024) for the sensitivities.
     """
-    posterior = chain.posterior()
+    posterior, best = chain.posterior(), chain.estimate
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape
-    best = chain.estimate
-    fit = fit_statistics(posterior, best.params)
-    residuals, checks, robust = None, sums(fit), {}
-    if isinstance(posterior, Posterior):
-        residuals = judge_residuals(posterior, best.params, best.covariance)
-        checks += residuals.checks
-    fitted = judge_fit(posterior, best, fit, residuals)
+    residuals, robust, frames, agreement = None, {}, {}, None
+    if isinstance(posterior, JointPosterior):
+        frames = {
+            name: diagnose(chain.frame(name), target_ess=target_ess, predictive=predictive)
+            for name in posterior.frames
+        }
+        agreement = frame_agreement(posterior, best.params)
+        fit = total_fit(frames, posterior)
+        fitted, checks = judge_frames(frames, agreement, fit, best), sums(fit)
+    else:
+        fit = fit_statistics(posterior, best.params)
+        checks = sums(fit)
+        if isinstance(posterior, Posterior):
+            residuals = judge_residuals(posterior, best.params, best.covariance)
+            checks += residuals.checks
+        fitted = judge_fit(posterior, best, fit, residuals)
     rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
     acceptance = efficiency = np.nan
     sampled_well = None
@@ -272,13 +299,13 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     else:
         efficiency = importance_efficiency(chain)
         sampling = judge_approximation(chain, efficiency)
-    if residuals is not None and not fitted.fits_data:
+    if residuals is not None and not fitted.fits_data and chain.whole is None:
         robust = _by_name(names, robust_sd(posterior, best.params, best.covariance))
-    if predictive:
+    if predictive and not frames:
         draws = chain.draws()
         some = np.linspace(0, len(draws) - 1, min(predictive, len(draws))).astype(int)
         checks += predictive_checks(posterior, draws[some], seed=chain.seed)
-    sensitivity = sensitivities(chain)
+    sensitivity = frame_sensitivities(frames, posterior) if frames else sensitivities(chain)
     return Diagnostics(
         sampled_well=sampled_well,
         fits_data=fitted.fits_data,
@@ -299,6 +326,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         robust_sd=robust,
         residuals=residuals,
         checks=check_table(checks),
+        frames=frames,
+        agreement=agreement,
         **fit,
     )
 

@@ -5,36 +5,41 @@ lacks it: once for each worker, regardless of the executor and of when the worke
 Task k's random numbers are those of `SeedSequence(seed).spawn`'s child k, so that answers do not
 depend on the workers or their order. Every finished task is a row of a table on disk before the
 next is waited for. A study that was stopped is resumed after its last complete row.
+
+A task that fails by what it works on has a row, which says why. One that fails by where it works,
+for want of memory or by a fault of the system, has none: it is done when the study is resumed.
 """
 
 import hashlib
 import json
-import multiprocessing
 import os
 import queue
-import signal
 import socket
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import PathLike
+from bayesfred.analysis.processes import new_pool, uninterrupted
+from bayesfred.analysis.study_table import check_same, resumed
 from bayesfred.errors import InputError, printable
 from bayesfred.io import tables
 from bayesfred.io.lock import only_writer
+from bayesfred.io.memory import require_room
 from bayesfred.io.paths import may_write
 from bayesfred.model.threads import one_thread
 from bayesfred.sampling.progress import progress_bar
 from bayesfred.sampling.sampler import versions
 
+SILENCE = 1.0  # seconds without an answer after which the workers are asked for
 WAITING = 4  # tasks sent ahead for each worker that is known
+BYTES_A_CELL = 150.0  # of a table that is read
 
 
 class Executor(Protocol):
@@ -45,6 +50,19 @@ class Executor(Protocol):
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> Any:
         """Begin a call and return its future."""
+
+
+@runtime_checkable
+class PlacedExecutor(Protocol):
+    """An executor that sends a call where it is asked to."""
+
+    def places(self) -> list[str]:
+        """Names of the workers that are there now, each as often as it has threads."""
+        ...
+
+    def submit_to(self, place: str, function: Any, /, *args: Any) -> "Future[Any]":
+        """Begin a call on a worker, or on another one if that is lost."""
+        ...
 
 
 class Study(Protocol):
@@ -61,12 +79,16 @@ class Study(Protocol):
         """The numbers of task k."""
 
 
+ENVIRONMENT = (MemoryError, OSError)  # where a task works, not what it works on
+
+
 class Answer(NamedTuple):
     """What comes back from a worker; neither numbers nor message where it lacks the study."""
 
     worker: str
     numbers: tuple[float, ...] | None
     message: str | None
+    environment: bool = False  # whether that is why there are no numbers
 
 
 _studies: dict[str, Study] = {}  # the study that this process works on, by its hash
@@ -91,6 +113,7 @@ def answer(key: str, study: Study | None, k: int) -> Answer:
             printable(
                 str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
             ),
+            isinstance(error, ENVIRONMENT),
         )
 
 
@@ -113,8 +136,8 @@ def run(
     study : Study
     n : int
     path : path-like
-        The table, .ecsv: a column `task`, the study's columns, NaN where a task failed, and a
-        column `message`.
+        The table, .ecsv: a column `task`, the study's columns, NaN where a task failed, a column
+        `message`, and a check of every row.
     meta : dict
         Stored in the table.
     executor : Executor, optional
@@ -129,56 +152,86 @@ def run(
     Returns
     -------
     TableRecord
-        The rows of tasks 0 to n - 1, in their order.
+        The rows of tasks 0 to n - 1, in their order, without the checks.
 
     Raises
     ------
     InputError
-        If the file exists, holds another study, or cannot be written; if a worker process dies.
-        What is finished is kept.
+        If the file exists, holds another study or rows that are not as they were written, or
+        cannot be written; if the table would not fit in memory; if a worker process dies, or a task
+        fails for want of memory. What is finished is kept.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise InputError(
             f"{path}: no folder {path.parent}, expected one to write the study to: create it"
         )
+    size = n * len(study.columns)
+    require_room(
+        f"study: got {n} frames, whose table", BYTES_A_CELL * size, "ask for fewer replicates"
+    )
     contents = study.contents()
     key = hashlib.sha256(json.dumps(contents).encode()).hexdigest()
+    everything = {**meta, "versions": versions(), "contents": contents}
     with only_writer(path):
         if not may_write(path, resume=resume, overwrite=overwrite):
             empty = {
                 "task": np.empty(0, np.int64),
                 **dict.fromkeys(study.columns, np.empty(0)),
-                "message": np.empty(0, "U1"),
+                **dict.fromkeys(("message", tables.CHECK), np.empty(0, "U1")),
             }
-            everything = {**meta, "versions": versions(), "contents": contents}
             tables.write_table(path, tables.TableRecord(empty, everything), overwrite=overwrite)
-        record = tables.read_table(path)
-        _check_same(path, record, study, contents)
+        text = tables.read_text(path)
+        record = tables.parse(path, text)
+        check_same(path, record, study.columns, everything)
+        tables.require_checks(path, text, key)
         done = set(record.columns["task"].tolist())
         todo = deque(k for k in range(n) if k not in done)
-        blank = [float("nan")] * len(study.columns)
         if todo:
-            with ExitStack() as stack:
-                append = stack.enter_context(tables.appending(path))
-                update = stack.enter_context(_progress(n, n - len(todo), progress))
-                for k, given in _answers(
-                    study, key, todo, stack.enter_context(_executor(executor, workers))
-                ):
-                    append(
-                        [
-                            k,
-                            *(blank if given.numbers is None else given.numbers),
-                            given.message or "",
-                        ]
-                    )
-                    update(given.numbers is None)
-            record = tables.read_table(path)
+            updated = resumed(record, everything)
+            if updated != record.meta:
+                tables.with_meta(path, text, tables.TableRecord(record.columns, updated))
+            lost = _work(study, key, todo, n, path, (executor, workers, progress))
+            if lost:
+                raise InputError(
+                    f"{path}: {len(lost)} of {n} tasks failed by no fault of theirs ({lost[0]}), "
+                    "expected memory and a system that works; what is finished is kept: resume, "
+                    "with fewer workers if it was because of insufficient memory"
+                )
+            text = tables.read_text(path)
+            tables.require_checks(path, text, key)
+            record = tables.parse(path, text)
     order = np.argsort(record.columns["task"], kind="stable")
     order = order[record.columns["task"][order] < n]
+    columns = {name: values for name, values in record.columns.items() if name != tables.CHECK}
     return tables.TableRecord(
-        {name: values[order] for name, values in record.columns.items()}, record.meta
+        {name: values[order] for name, values in columns.items()}, record.meta
     )
+
+
+def _work(
+    study: Study,
+    key: str,
+    todo: deque[int],
+    n: int,
+    path: Path,
+    how: tuple[Executor | None, int | None, bool],
+) -> list[str]:
+    """Do tasks and append their rows; the messages of those that the environment made fail."""
+    executor, workers, progress = how
+    blank, lost = [float("nan")] * len(study.columns), []
+    with ExitStack() as stack:
+        append = stack.enter_context(tables.appending(path, key))
+        update = stack.enter_context(_progress(n, n - len(todo), progress))
+        pool = stack.enter_context(_executor(executor, workers))
+        for k, given in _answers(study, key, todo, pool):
+            message = given.message or ""
+            if given.environment:
+                lost.append(message)
+            else:
+                append([k, *(blank if given.numbers is None else given.numbers), message])
+            update(given.numbers is None)
+    return lost
 
 
 def _answers(
@@ -193,13 +246,8 @@ def _answers(
     workers: set[str] = set()
 
     def send(k: int, with_study: bool) -> None:
-        # a process that begins here must not meet a Ctrl-C before it has learnt to leave it to this
-        # one
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with uninterrupted():
             future = executor.submit(answer, key, study if with_study else None, k)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         waiting.add(future)
         future.add_done_callback(lambda done: finished.put((k, done)))
 
@@ -207,11 +255,16 @@ def _answers(
         while todo or waiting:
             while todo and finished.empty() and len(waiting) < 2 + WAITING * len(workers):
                 send(todo.popleft(), not workers)
-            k, future = finished.get()
+            try:
+                k, future = finished.get(timeout=SILENCE)
+            except queue.Empty:
+                _require_workers(executor)
+                continue
             waiting.discard(future)
             try:
                 given = future.result()
             except Exception as error:  # a task's own errors are answers
+                _require_workers(executor)
                 raise InputError(
                     f"study: the workers failed ({type(error).__name__}: {error}), expected them "
                     "to live; what is finished is "
@@ -225,6 +278,12 @@ def _answers(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def _require_workers(executor: Executor) -> None:
+    """Raise where nobody will answer, if the executor can tell."""
+    if isinstance(executor, PlacedExecutor):
+        executor.places()
 
 
 class _Here:
@@ -246,61 +305,11 @@ def _executor(executor: Executor | None, workers: int | None) -> Iterator[Execut
     elif workers == 1:
         yield _Here()
     else:
-        pool = ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), initializer=_follow
-        )
+        pool = new_pool(workers)
         try:
             yield pool
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _follow() -> None:
-    """Begin a process of the pool.
-
-    It ends with the process that keeps the answers, and not by a Ctrl-C, which reaches all of them.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-@contextmanager
-def cluster(address: str) -> Iterator[Executor]:
-    """The Dask cluster whose scheduler listens at an address.
-
-    Parameters
-    ----------
-    address : str
-        Such as tcp://node:8786.
-
-    Raises
-    ------
-    InputError
-        If Dask's `distributed` is not installed, or nothing answers there.
-    """
-    try:
-        from distributed import Client  # noqa: PLC0415 - an optional dependency
-    except ImportError:
-        raise InputError(
-            "--scheduler: distributed is not installed, expected it: pip install 'bayesfred[dask]'"
-        ) from None
-    try:
-        client = Client(address, timeout=10)
-    except (OSError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"--scheduler: got {address!r} ({reason}), expected a Dask scheduler's address: "
-            "tcp://host:port"
-        ) from None
-    with client:
-        yield client.get_executor()
 
 
 @contextmanager
@@ -316,20 +325,3 @@ def _progress(total: int, completed: int, show: bool) -> Iterator[Callable[[bool
             tell(completed, total, f"{completed}/{total}" + f" {failures} failed" * (failures > 0))
 
         yield update
-
-
-def _check_same(
-    path: Path, record: tables.TableRecord, study: Study, contents: Mapping[str, str]
-) -> None:
-    """Refuse to resume another study."""
-    stored = record.meta.get("contents")
-    if not isinstance(stored, dict) or list(record.columns) != ["task", *study.columns, "message"]:
-        raise InputError(
-            f"{path}: got a table of something else, expected one of this study: write elsewhere"
-        )
-    changed = [name for name in contents if stored.get(name) != contents[name]]
-    if changed:
-        raise InputError(
-            f"{path}: holds a study with another {', '.join(changed)}, expected the same: write "
-            "elsewhere, or overwrite"
-        )

@@ -32,7 +32,8 @@ import numpy as np
 from scipy import stats
 
 from bayesfred._typing import Floats
-from bayesfred.model.posterior import Posterior
+from bayesfred.analysis.joint_folds import AnyPosterior, are_scales, columns_of
+from bayesfred.model.joint import JointPosterior
 from bayesfred.optimize.estimate import inverse
 
 __all__ = ["REAL", "ExtraParameters", "contained", "judge_extra"]
@@ -120,16 +121,16 @@ def judge_extra(
     return ExtraParameters(names, chi2, math.sqrt(ratio), p)
 
 
-def contained(leaner: Posterior, params: Floats, larger: Posterior) -> Floats | None:
+def contained(leaner: AnyPosterior, params: Floats, larger: AnyPosterior) -> Floats | None:
     """The larger model's parameters at which it is the leaner one.
 
     Parameters
     ----------
-    leaner : Posterior
+    leaner : Posterior or JointPosterior
     params : ndarray, shape (d,), parameter units
         Its parameters.
-    larger : Posterior
-        Of the same frame.
+    larger : Posterior or JointPosterior
+        Of the same frame or frames.
 
     Returns
     -------
@@ -138,14 +139,18 @@ def contained(leaner: Posterior, params: Floats, larger: Posterior) -> Floats | 
         value in the leaner model is a bound.
     """
     added = set(larger.parameter_names) - set(leaner.parameter_names)
-    if not added or added & set(larger.hyperparameters):
+    scales = columns_of(larger, are_scales)
+    if not added or added & set(np.array(larger.parameter_names)[scales].tolist()):
         return None
     if set(leaner.parameter_names) - set(larger.parameter_names):
         return None
     known = dict(zip(leaner.parameter_names, params, strict=True))
     values = np.array([known.get(p.name, p.neutral) for p in larger.parameters])
-    one, other = (
-        model.likelihood.log_likelihood(at[None], np.ones(1, bool))[0]
-        for model, at in ((leaner, params), (larger, values))
-    )
+    one, other = (_log_likelihood(model, at) for model, at in ((leaner, params), (larger, values)))
     return values if abs(one - other) < SAME else None
+
+
+def _log_likelihood(posterior: AnyPosterior, params: Floats) -> float:
+    if isinstance(posterior, JointPosterior):
+        return float(posterior.log_prob(params) - posterior.log_prior(params)[0])
+    return float(posterior.likelihood.log_likelihood(params[None], np.ones(1, bool))[0])

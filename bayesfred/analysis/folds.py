@@ -71,6 +71,25 @@ def fold_sources(posterior: Posterior, params: Floats, number: int) -> Folds:
     -------
     Folds
     """
+    there = visible(posterior, params)
+    sources = np.full(len(posterior.model.sources), -1)
+    sources[there] = np.arange(there.size) % number
+    return share_pixels(posterior, params, sources)
+
+
+def visible(posterior: Posterior, params: Floats) -> Ints:
+    """Sources whose image is on a pixel of the likelihood.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+
+    Returns
+    -------
+    ndarray of int, shape (m,)
+        In the order of a path along the images that visits the field in bands, to and fro.
+    """
     positions = posterior.likelihood.image_positions(params)
     ny, nx = posterior.model.detector.shape
     step = posterior.model.detector.binning
@@ -78,11 +97,27 @@ def fold_sources(posterior: Posterior, params: Floats, number: int) -> Folds:
     pixel = np.nan_to_num(pixel, nan=-1.0).astype(int)  # without an image, in no pixel
     column, row = np.clip(pixel, 0, [nx - 1, ny - 1]).T
     seen = np.all(pixel == np.stack([column, row], axis=1), axis=1)
-    seen &= posterior.mask[row, column]
-    there = np.flatnonzero(seen)
-    sources = np.full(seen.size, -1)
-    sources[there[_path(positions[there])]] = np.arange(there.size) % number
-    pixels = np.full((ny, nx), -1)
+    there = np.flatnonzero(seen & posterior.mask[row, column])
+    return there[_path(positions[there])]
+
+
+def share_pixels(posterior: Posterior, params: Floats, sources: Ints) -> Folds:
+    """Give folds of sources their pixels.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+    sources : ndarray of int, shape (n,)
+        Fold of each source, -1 for those whose image is on no pixel of the likelihood.
+
+    Returns
+    -------
+    Folds
+    """
+    positions = posterior.likelihood.image_positions(params)
+    there = np.flatnonzero(sources >= 0)
+    pixels = np.full(posterior.mask.shape, -1)
     if there.size:
         owner = _owners(posterior, params, positions[there], posterior.fluxes(params)[there])
         pixels[posterior.mask] = sources[there][owner]

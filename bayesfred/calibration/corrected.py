@@ -19,6 +19,8 @@ from astropy.wcs import WCS
 from bayesfred._typing import Flags, Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io import atomic
+from bayesfred.io.fits_images import open_fits
+from bayesfred.io.frames import require_memory
 from bayesfred.io.paths import may_write
 from bayesfred.io.reading import readable, require_file
 
@@ -174,10 +176,11 @@ def read_grid(path: PathLike) -> tuple[WCS, tuple[int, int]]:
 def _first_image(path: Path) -> tuple[fits.Header, tuple[int, int]]:
     """The header of the first image with two axes, and its shape."""
     require_file(path)
-    with readable(path, "FITS"), fits.open(path, memmap=False) as hdus:
+    with open_fits(path) as hdus:
         header = hdus[0].header.copy()
         for hdu in hdus:
             if hdu.is_image and len(hdu.shape) == 2:
+                require_memory(f"{path}", hdu.shape)
                 header.update(hdu.header)
                 return header, (int(hdu.shape[0]), int(hdu.shape[1]))
     raise InputError(f"{path}: got no image with two axes, expected one")

@@ -1,6 +1,5 @@
 """Commands that hand a calibration over, and use it."""
 
-import os
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,14 @@ from bayesfred.calibration.opencv import opencv_camera, write_opencv
 from bayesfred.calibration.plate import Truncation
 from bayesfred.calibration.regions import write_regions
 from bayesfred.calibration.wcs import sip, tpv
-from bayesfred.errors import InputError
-from bayesfred.io import atomic, paths
+from bayesfred.errors import InputError, printable
+from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.frames import read_frame
-from bayesfred.pipeline import Say
+from bayesfred.model.joint import JointPosterior
 from bayesfred.records import Calibrated, Corrected
 from bayesfred.reporting.calibration import STEPS, calibration_plot
 from bayesfred.reporting.style import png
+from bayesfred.results import Say
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.progress import searching
@@ -45,6 +45,7 @@ def calibration(
     form: str | None = None,
     degree: int = 3,
     focal_length: float | None = None,
+    frame: str | None = None,
     out: PathLike | None = None,
     overwrite: bool = False,
     say: Say | None = None,
@@ -60,6 +61,8 @@ def calibration(
         Of the polynomials of a header or a gwcs.
     focal_length : float, optional, recorded pixel
         For OpenCV, where the object plane has no place on the sky.
+    frame : str, optional
+        Which of several frames: they share the lens and differ in where they point.
     out : path-like, optional
         The file; by default beside the chain, and maps and picture beside it.
     overwrite : bool
@@ -79,15 +82,15 @@ def calibration(
     """
     chain_file = Path(chain_file)
     label, suffix = FORMATS[form] if form else ("calibration", ".calibration.h5")
-    path = chain_file.with_suffix(suffix) if out is None else Path(out)
+    chain = _chain_of(chain_file, frame)
+    named = chain_file if frame is None else outputs.of_frame(chain_file, frame)
+    path = named.with_suffix(suffix) if out is None else Path(out)
     ending = f".{suffix.rpartition('.')[2]}"
     if path.suffix != ending:
         raise InputError(f"{path}: got a file ending in {path.suffix!r}, expected {ending}")
-    if os.path.exists(path) and os.path.exists(chain_file) and path.samefile(chain_file):
-        raise InputError(f"{path}: got the chain's file, expected another: it would be replaced")
     maps, picture = (path.with_suffix(s) for s in (".fits", ".png"))
-    paths.may_write(path, overwrite=overwrite, beside=() if form else (maps, picture))
-    chain = open_chain(chain_file)
+    beside = () if form else (maps, picture)
+    paths.may_write(path, overwrite=overwrite, beside=beside, inputs=(chain_file,))
     with searching("judging the fit") if say else nullcontext():
         known = Calibration.from_chain(chain)
     if form is None:
@@ -97,10 +100,27 @@ def calibration(
         figure = calibration_plot(
             known, known.displacement_map(step), known.psf_map(step), hull_of(known.sources)
         )
+        paths.may_write(picture, overwrite=overwrite)
         atomic.replace(picture, png(figure))
         return Calibrated(known, {label: path, "maps": maps, "picture": picture})
     lines = _export(chain, known, form, path, (degree, focal_length, overwrite))
     return Calibrated(known, {label: path}, lines)
+
+
+def _chain_of(chain_file: Path, frame: str | None) -> Chain:
+    """The chain of a frame; of several frames, that of the one that is named."""
+    chain = open_chain(chain_file)
+    posterior = chain.posterior()
+    if not isinstance(posterior, JointPosterior):
+        if frame is not None:
+            raise InputError(f"{chain_file}: got --frame {frame}, expected none: it has one frame")
+        return chain
+    if frame is None or frame not in posterior.frames:
+        got = "no --frame" if frame is None else f"--frame {printable(frame)}"
+        raise InputError(
+            f"{chain_file}: got {got}, expected one of its frames: {', '.join(posterior.frames)}"
+        )
+    return chain.frame(frame)
 
 
 def _export(
@@ -169,11 +189,8 @@ def correct(
     path = Path(out)
     if path.suffix.lower() not in (".fits", ".fit", ".fts"):
         raise InputError(f"{path}: got a file ending in {path.suffix!r}, expected .fits")
-    paths.may_write(path, overwrite=overwrite)
     inputs = [frame, calibration, *([] if like is None else [like])]
-    for read in inputs:
-        if os.path.exists(path) and os.path.exists(read) and path.samefile(read):
-            raise InputError(f"{path}: got a file that is read, expected another to write")
+    paths.may_write(path, overwrite=overwrite, inputs=inputs)
     known = Calibration.read(calibration)
     record = read_frame(frame, gain=gain, pedestal=pedestal)
     wcs, shape = (None, None) if like is None else read_grid(like)

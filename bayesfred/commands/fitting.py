@@ -1,11 +1,10 @@
 """Commands that make and fit frames: simulate them, fit them, report."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bayesfred import build, pipeline, settings
+from bayesfred import build, joint_pipeline, pipeline, settings
 from bayesfred._typing import PathLike
 from bayesfred.analysis.photons import photons_needed
 from bayesfred.errors import InputError
@@ -13,8 +12,10 @@ from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
-from bayesfred.pipeline import Say
-from bayesfred.records import Result, Simulated
+from bayesfred.joint_settings import JointRun, read_run
+from bayesfred.model.joint import JointPosterior
+from bayesfred.records import JointResult, Result, Simulated
+from bayesfred.results import How, Job, Say, may_write_run, write_results
 from bayesfred.sampling.chainfile import open_chain
 
 DEMO_ERROR = 0.001  # pixel
@@ -63,8 +64,9 @@ def demo(
     example = Path(settings.__file__).with_name("example.toml")
     run = settings.read_settings(example).seeded(seed)
     posterior, truth = build.simulated(run, example, seed)
-    job = pipeline.Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
-    result = pipeline.fit_frame(job, posterior, map_only=map_only, overwrite=overwrite, say=say)
+    job = Job(run, Path("demo"), output, (DEMO_NOTE,), truth)
+    how = How(map_only=map_only, overwrite=overwrite)
+    result = pipeline.fit_frame(job, posterior, None, how, say=say)
     needed = photons_needed(posterior, result.chain.estimate.params, DEMO_ERROR)
     return replace(result, photons=needed)
 
@@ -101,7 +103,9 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     folder, grid = run_file.parent, simulation.grid is not None
     frame = paths.within(folder, run.frame.path, f"{run_file}: frame.path")
     catalogue = paths.within(folder, run.catalogue.path or "", f"{run_file}: catalogue.path")
-    paths.may_write(frame, overwrite=overwrite, beside=(catalogue,) if grid else ())
+    written = (frame, catalogue) if grid else (frame,)
+    inputs = build.inputs(run, run_file, build.SECTIONS[len(written) :])  # the others are made
+    paths.may_write(frame, overwrite=overwrite, beside=written[1:], inputs=inputs)
     if grid:
         s = posterior.model.sources
         record = CatalogueRecord(s.x, s.y, s.flux)
@@ -117,8 +121,8 @@ def fit(
     resume: bool = False,
     overwrite: bool = False,
     say: Say | None = None,
-) -> Result:
-    """Fit the frame of a run file: MAP, draws, diagnostics, report.
+) -> Result | JointResult:
+    """Fit the frame of a run file, or its frames together: MAP, draws, diagnostics, report.
 
     Parameters
     ----------
@@ -135,7 +139,7 @@ def fit(
 
     Returns
     -------
-    Result
+    Result or JointResult
 
     Raises
     ------
@@ -143,23 +147,37 @@ def fit(
         If the run file, the frame or the catalogue is unusable, or the output file exists.
     """
     run_file = Path(run_file)
-    run = settings.read_settings(run_file)
+    run = read_run(run_file)
     given = run.output.path or Path("chains", f"{run_file.stem}.h5")
     # inside the folder in which the run is started, whatever a run file from elsewhere says
     output = paths.within(".", given, f"{run_file}: output.path")
-    frame = paths.resolve(run.frame.path, run_file, must_exist=True)
-    if os.path.exists(output) and output.samefile(frame):
-        raise InputError(
-            f"{run_file}: output.path: got the frame's file, expected another: the chain would "
-            "replace the frame"
-        )
+    how = How(map_only=map_only, resume=resume, overwrite=overwrite)
+    if isinstance(run, JointRun):
+        return _fit_frames(run, run_file, output, how, say)
+    paths.resolve(run.frame.path, run_file, must_exist=True)
+    inputs = build.inputs(run, run_file)
+    paths.may_write(output, overwrite=True, inputs=inputs, beside=outputs.beside(output))
     posterior, estimate, notes = pipeline.read_frame(run, run_file, say)
     if run.output.path is None:
         outputs.make_folder(output)
-    job = pipeline.Job(run, run_file, output, notes)
-    return pipeline.fit_frame(
-        job, posterior, estimate, map_only=map_only, resume=resume, overwrite=overwrite, say=say
-    )
+    job = Job(run, run_file, output, notes, inputs=inputs)
+    return pipeline.fit_frame(job, posterior, estimate, how, say=say)
+
+
+def _fit_frames(
+    run: JointRun, run_file: Path, output: Path, how: How, say: Say | None
+) -> JointResult:
+    """Fit several frames together; what would be refused at the end is refused before."""
+    joint_pipeline.require_frames(run, run_file)
+    inputs = build.inputs(run, run_file)
+    beside = joint_pipeline.files_beside(output, dict.fromkeys(run.frames))
+    paths.may_write(output, overwrite=True, inputs=inputs, beside=beside)
+    if run.output.path is None:
+        outputs.make_folder(output)
+    may_write_run(output, how, beside, inputs)
+    posterior, estimate, notes = joint_pipeline.read_frames(run, run_file, say)
+    job = Job(run, run_file, output, notes, inputs=inputs)
+    return joint_pipeline.fit_frames(job, posterior, estimate, how, say=say)
 
 
 def report(
@@ -169,7 +187,7 @@ def report(
     corner: Sequence[str] = (),
     out: PathLike | None = None,
     overwrite: bool = False,
-) -> Result:
+) -> Result | JointResult:
     """Judge a chain file again, and write its page and picture.
 
     Parameters
@@ -187,7 +205,7 @@ def report(
 
     Returns
     -------
-    Result
+    Result or JointResult
 
     Raises
     ------
@@ -196,10 +214,18 @@ def report(
         picture or table exists, or `corner` names what is no parameter.
     """
     path, chain = Path(chain_file), open_chain(chain_file)
-    default, *others = outputs.beside(path if out is None else Path(out))
-    page = default if out is None else Path(out)
-    if isinstance(chain.posterior().model.psf, MeasuredPSF):
-        others.append(outputs.psf_beside(page))
+    posterior, start = chain.posterior(), path if out is None else Path(out)
+    if isinstance(posterior, JointPosterior):
+        default, *others = joint_pipeline.files_beside(start, posterior.frames)
+    else:
+        default, *others = outputs.beside(start)
+        if isinstance(posterior.model.psf, MeasuredPSF):
+            others.append(outputs.psf_beside(start))
+    page = default if out is None else start
     outputs.may_write_page(page, *others, inputs=(path,), overwrite=overwrite)
     ess = target_ess or chain.target_ess
-    return pipeline.write_results(chain, path, page, target_ess=ess, corner=corner)
+    if isinstance(posterior, JointPosterior):
+        return joint_pipeline.write_joint_results(
+            chain, path, page, target_ess=ess, corner=corner, overwrite=overwrite
+        )
+    return write_results(chain, path, page, target_ess=ess, corner=corner, overwrite=overwrite)

@@ -5,19 +5,26 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from bayesfred import build, pipeline, settings
+from bayesfred import build, joint_pipeline, pipeline, settings
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
+from bayesfred.analysis.dask_cluster import cluster, unencrypted
 from bayesfred.analysis.diagnostics import diagnose
-from bayesfred.analysis.executor import cluster
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import SBCResult, simulation_based_calibration
+from bayesfred.analysis.study_table import known_by
+from bayesfred.build import naming
 from bayesfred.errors import InputError
-from bayesfred.io import outputs, paths
-from bayesfred.pipeline import Say
+from bayesfred.io import atomic, marks, outputs, paths, tables
+from bayesfred.joint_settings import JointRun, read_run
+from bayesfred.model.joint import JointPosterior
+from bayesfred.model.posterior import Posterior
 from bayesfred.records import Compared, Study
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
+from bayesfred.reporting.studies import calibration_plot, noise_plot
+from bayesfred.reporting.style import png
+from bayesfred.results import Say
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
 from bayesfred.simulation_sections import StudySettings
@@ -70,7 +77,10 @@ def study(
     given = s.path or Path("chains", f"{run_file.stem}.{kind}.ecsv")
     table = paths.within(".", given, f"{run_file}: study.path")
     others = outputs.beside_study(table)
-    paths.may_write(table, overwrite=overwrite, resume=resume, beside=others)
+    paths.require_plain(table, *others, *paths.hidden(table))
+    inputs = build.inputs(run, run_file)
+    if paths.may_write(table, overwrite=overwrite, resume=resume, beside=others, inputs=inputs):
+        marks.may_replace(known_by(table), *others)
     if kind == "noise":
         build.simulation(run, run_file)
     truth: Floats | None = None
@@ -80,8 +90,10 @@ def study(
         posterior, truth = build.simulated(run, run_file, simulation.seed)
     if s.path is None:
         outputs.make_folder(table)
+    if say and scheduler and (line := unencrypted(scheduler)):
+        say(line)
     with ExitStack() as stack:
-        stack.enter_context(pipeline.naming(run_file))
+        stack.enter_context(naming(run_file))
         executor = stack.enter_context(cluster(scheduler)) if scheduler else None
         how: dict[str, Any] = {
             "replicates": s.replicates, "seed": s.seed, "path": table, "executor": executor,
@@ -98,7 +110,26 @@ def study(
             )  # fmt: skip
         else:
             result = simulation_based_calibration(posterior, method=s.method or "mcmc", **how)
-    return pipeline.write_study(result, posterior, table)
+    return _write_study(result, posterior, table, overwrite=overwrite)
+
+
+def _write_study(
+    result: NoiseStudy | SBCResult, posterior: Posterior, table: Path, *, overwrite: bool
+) -> Study:
+    """Write the summary and the figure of a study beside its table."""
+    findings, picture = outputs.beside_study(table)
+    if isinstance(result, NoiseStudy):
+        kind, found, figure = "noise", result.cells, noise_plot(result, posterior.parameters)
+    else:
+        figure = calibration_plot(result, posterior.parameters)
+        kind, found = "sbc", result.quantities
+    record = tables.TableRecord(found, {"study": kind, "message": result.message})
+    run = known_by(table)
+    if not overwrite:  # asked again, as what was not there may have come in the meantime
+        marks.may_replace(run, findings, picture)
+    tables.write_table(findings, record, overwrite=True, run=run)
+    atomic.replace(picture, marks.marked(png(figure), run))
+    return Study(result, table, findings, picture)
 
 
 def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Verification:
@@ -175,6 +206,7 @@ def compare(
             ComparedRun(name, chain, diagnose(chain, target_ess=chain.target_ess))
             for name, chain in chains.items()
         ]
+        outputs.may_write_page(page, inputs=names, overwrite=overwrite)  # it may have come since
         write_comparison(page, runs, ranking, reason)
     return Compared(ranking, reason, page)
 
@@ -198,6 +230,12 @@ def crosscheck(run_file: PathLike, *, say: Say | None = None) -> cross_check.Cro
         If the run file, the frame or the catalogue is unusable, or the sources are too few.
     """
     run_file = Path(run_file)
-    posterior, estimate, _ = pipeline.read_frame(settings.read_settings(run_file), run_file, say)
-    with pipeline.naming(run_file):
+    run = read_run(run_file)
+    posterior: Posterior | JointPosterior
+    if isinstance(run, JointRun):
+        joint_pipeline.require_frames(run, run_file)
+        posterior, estimate, _ = joint_pipeline.read_frames(run, run_file, say)
+    else:
+        posterior, estimate, _ = pipeline.read_frame(run, run_file, say)
+    with naming(run_file):
         return cross_check.cross_check(posterior, estimate=estimate)

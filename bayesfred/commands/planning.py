@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesfred import build, pipeline, settings
+from bayesfred import build, settings
 from bayesfred._typing import PathLike
 from bayesfred.analysis import design as designs
+from bayesfred.build import naming
 from bayesfred.errors import InputError
 from bayesfred.io import atomic, outputs, paths, tables
 from bayesfred.model.parameters import SCALES
@@ -56,19 +57,21 @@ def design(run_file: PathLike, *, overwrite: bool = False) -> Planned:
     given = s.path or Path("chains", f"{run_file.stem}.design.ecsv")
     table = paths.within(".", given, f"{run_file}: design.path")
     picture = table.with_suffix(".png")
-    paths.may_write(table, overwrite=overwrite, beside=(picture,))
+    inputs = build.inputs(run, run_file)
+    paths.may_write(table, overwrite=overwrite, beside=(picture,), inputs=inputs)
     posterior, truth = build.simulated(run, run_file, build.simulation(run, run_file).seed)
     # a scale of zero has no density: sources scatter, and the model errs, as much as a fit assumes
     starts = zip(posterior.parameters, truth, strict=True)
     truth = np.array([q.start if q.name in SCALES else value for q, value in starts])
-    with pipeline.naming(run_file):
+    with naming(run_file):
         plan = designs.design(
             posterior, truth, error=s.error, criterion=s.criterion, sources=s.sources,
             dithers=s.dithers, frames=s.frames,
         )  # fmt: skip
     if s.path is None:
         outputs.make_folder(table)
-    tables.write_table(table, _record(plan, posterior), overwrite=True)
+    paths.may_write(table, overwrite=overwrite, beside=(picture,))  # they may have come since
+    tables.write_table(table, _record(plan, posterior), overwrite=overwrite)
     atomic.replace(picture, png(design_plot(plan)))
     return Planned(plan, table, picture)
 

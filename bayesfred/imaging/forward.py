@@ -31,6 +31,29 @@ from bayesfred.io.serialize import serializable
 # 1 % at this width.
 NARROWEST_IMPULSE = math.sqrt(math.log(400.0) / (2.0 * math.pi**2))
 
+WIDEST = 4.0  # sides of the frame; a PSF of this width differs by 1 % over the frame
+
+
+def require_image(sigma: float, fine_shape: tuple[int, int], where: str = "") -> None:
+    """Refuse a PSF so much wider than the frame that it is flat there.
+
+    Parameters
+    ----------
+    sigma : float, fine pixel
+    fine_shape : (int, int), fine pixel
+    where : str
+        What the line begins with.
+
+    Raises
+    ------
+    InputError
+    """
+    if not sigma <= WIDEST * max(fine_shape):
+        raise InputError(
+            f"{where}psf: sigma: got {sigma:.4g} pixels in a frame of {max(fine_shape)}, expected "
+            "images that the frame shows: check its unit, which is the pixel"
+        )
+
 
 @serializable("model")
 @dataclass(frozen=True)
@@ -57,7 +80,8 @@ class ForwardModel:
     Raises
     ------
     InputError
-        If the tolerance is outside [0, 1), or the PSF is too narrow to be sampled at pixel centres.
+        If the tolerance is outside [0, 1), the PSF is far wider than the frame, or it is too narrow
+        to be sampled at pixel centres.
 
     References
     ----------
@@ -84,6 +108,7 @@ class ForwardModel:
     def __post_init__(self) -> None:
         if not 0.0 <= self.tolerance < 1.0:
             raise InputError(f"model: tolerance: got {self.tolerance}, expected 0 <= tolerance < 1")
+        require_image(self.psf.sigma, self.detector.fine_shape)
         if has_pixel(self.psf):
             if self.detector.pixel != "impulse" or self.detector.binning != 1:
                 raise InputError(

@@ -7,6 +7,7 @@ its column. `atomic.replace` does the writing.
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 import warnings
@@ -24,7 +25,7 @@ from bayesfred.errors import InputError
 from bayesfred.io.atomic import replace
 from bayesfred.io.frames import LARGEST_COUNT
 from bayesfred.io.paths import may_write
-from bayesfred.io.reading import readable, require_file
+from bayesfred.io.reading import read_lines, readable, require_file
 from bayesfred.io.sky import degrees, moved
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
 ]
 
 MOTION = units.mas / units.yr
+HEADING = "heading"
 _FORMATS = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv"}
 
 
@@ -241,15 +243,22 @@ def _table(path: Path) -> Table:
     require_file(path)
     with readable(path, "table"), warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
-        # A byte order mark would become part of the first column's name.
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_lines(path)
         # Astropy's fast reader silently drops what follows an unclosed quotation mark.
         table = Table.read(lines, format=table_format, fast_reader=False) if any(lines) else Table()
+        table.meta = {HEADING: _heading(lines, ecsv=table_format == "ascii.ecsv")}
     if len(table) == 0:
         raise InputError(
             f"{path}: got an empty catalogue, expected a heading and at least one source"
         )
     return table
+
+
+def _heading(lines: list[str], *, ecsv: bool) -> list[str]:
+    """The names of the columns as they are written: astropy gives one that comes again another."""
+    comma = not ecsv or "# delimiter: ','" in lines
+    named = (line for line in lines if line.strip() and not (ecsv and line.startswith("#")))
+    return [name.strip() for name in next(csv.reader(named, delimiter="," if comma else " "), [])]
 
 
 def _fluxes(
@@ -320,6 +329,11 @@ def _present(path: Path, table: Table, name: str) -> Any:
         present = ", ".join(map(repr, table.colnames))
         raise InputError(
             f"{path}: got no column {name!r}, expected one of: {present}; give its name"
+        )
+    if table.meta[HEADING].count(name) > 1:
+        raise InputError(
+            f"{path}: got column {name!r} {table.meta[HEADING].count(name)} times, expected it "
+            "once: remove or rename the others"
         )
     return table[name]
 

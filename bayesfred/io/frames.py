@@ -26,6 +26,7 @@ from bayesfred.errors import InputError, printable
 from bayesfred.io.atomic import replace
 from bayesfred.io.fits_images import StoredImage, read_fits
 from bayesfred.io.headers import conversion
+from bayesfred.io.memory import require_room
 from bayesfred.io.paths import may_write
 from bayesfred.io.pictures import read_picture
 from bayesfred.io.reading import readable, require_file
@@ -265,7 +266,7 @@ def write_frame(path: PathLike, counts: ArrayLike, *, overwrite: bool = False) -
 
 
 def require_memory(where: str, shape: tuple[int, int]) -> None:
-    """Refuse a frame of which a fit would not fit in this machine's memory.
+    """Refuse a frame of which a fit would not fit in memory, see `memory.allowed_memory`.
 
     Parameters
     ----------
@@ -278,16 +279,11 @@ def require_memory(where: str, shape: tuple[int, int]) -> None:
     InputError
         With the estimate.
     """
-    need, memory = (
+    require_room(
+        f"{where}: got {_by(shape)} pixels, whose fit",
         math.prod(shape) * _BYTES_A_PIXEL,
-        os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"),
+        "cut the frame or bin it",
     )
-    if need > memory:
-        raise InputError(
-            f"{where}: got {_by(shape)} pixels, whose fit would need about {need / 1e9:.3g} GB of "
-            "memory, expected at most the "
-            f"{memory / 1e9:.3g} GB of this machine: cut the frame or bin it"
-        )
 
 
 def _format(path: Path) -> str:

@@ -14,6 +14,8 @@ from pathlib import Path
 import filelock
 
 from bayesfred.errors import InputError
+from bayesfred.io.paths import hidden, require_plain
+from bayesfred.io.reading import require_file
 
 PATIENCE = 0.1  # seconds; the lock of a writer that was killed is free at once
 
@@ -32,8 +34,9 @@ def only_writer(path: Path) -> Iterator[None]:
     InputError
         If another process, which is named, is writing it, or its folder cannot be written.
     """
-    lock = filelock.FileLock(path.with_name(f".{path.name}.lock"), PATIENCE)
-    holder = path.with_name(f".{path.name}.writer")
+    place, holder, _ = hidden(path)
+    require_plain(place)
+    lock = filelock.FileLock(place, PATIENCE)
     try:
         lock.acquire()
         since = datetime.now().astimezone().isoformat(" ", "seconds")
@@ -61,8 +64,9 @@ def only_writer(path: Path) -> Iterator[None]:
 def _told(holder: Path) -> str:
     """What the holder says of itself, in a form that can be shown."""
     try:
+        require_file(holder)
         with open(holder, encoding="utf-8", errors="replace") as stream:
             text = stream.read(200)
-    except OSError:
+    except (InputError, OSError):
         return ""
     return f" ({''.join(c for c in text if c.isprintable())})"

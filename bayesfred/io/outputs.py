@@ -4,7 +4,6 @@
 written with it.
 """
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from bayesfred.errors import InputError
 from bayesfred.io import atomic
 from bayesfred.io.paths import may_write
 
-__all__ = ["beside", "beside_study", "make_folder", "may_write_page", "psf_beside"]
+__all__ = ["beside", "beside_study", "make_folder", "may_write_page", "of_frame", "psf_beside"]
 
 
 def beside(path: Path) -> tuple[Path, Path, Path]:
@@ -33,6 +32,28 @@ def beside(path: Path) -> tuple[Path, Path, Path]:
     """
     page, picture, sources = (path.with_suffix(s) for s in (".html", ".png", ".sources.ecsv"))
     return page, picture, sources
+
+
+def of_frame(path: Path, name: str) -> Path:
+    """Name what is written of one of several frames: `beside` and `psf_beside` name its files.
+
+    Parameters
+    ----------
+    path : Path
+        The chain file of all frames, or their page.
+    name : str
+        The frame's.
+
+    Returns
+    -------
+    Path
+
+    Examples
+    --------
+    >>> [path.name for path in beside(of_frame(Path("run.h5"), "night2"))]
+    ['run.night2.html', 'run.night2.png', 'run.night2.sources.ecsv']
+    """
+    return path.with_suffix(f".{name}{path.suffix}")
 
 
 def psf_beside(path: Path) -> Path:
@@ -92,17 +113,11 @@ def may_write_page(page: Path, *others: Path, inputs: Sequence[Path], overwrite:
         If a file exists, the page is not called NAME.html, its folder is missing, or a chain would
         be replaced.
     """
-    for path in inputs:
-        if any(os.path.abspath(path) == os.path.abspath(place) for place in (page, *others)):
-            raise InputError(
-                f"{path}: got a chain named as its report, which would replace it, expected "
-                "NAME.h5: rename it"
-            )
     if page.suffix != ".html":
         raise InputError(f"{page}: got a page with another suffix, expected NAME.html")
     if not page.parent.is_dir():
         raise InputError(f"{page}: no folder {page.parent}, expected one to write to: create it")
-    may_write(page, overwrite=overwrite, beside=others)
+    may_write(page, overwrite=overwrite, beside=others, inputs=inputs)
 
 
 def make_folder(path: Path) -> None:

@@ -1,7 +1,8 @@
 """Which files a run reads and writes: where they are, and what may be replaced.
 
 :func:`resolve` finds the files that a run file names, :func:`within` keeps what is written inside a
-folder, and :func:`may_write` is the one answer to "the file exists": refuse, resume or overwrite.
+folder, and :func:`may_write` is the one answer to "the file exists": refuse, resume or overwrite,
+but never what is read. Of a run that is resumed `marks.may_replace` tells which files are its own.
 """
 
 import errno
@@ -12,7 +13,7 @@ from pathlib import Path
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
 
-__all__ = ["may_write", "resolve", "within"]
+__all__ = ["hidden", "may_write", "require_plain", "resolve", "within"]
 
 
 def may_write(
@@ -21,8 +22,9 @@ def may_write(
     overwrite: bool,
     resume: bool | None = None,
     beside: Sequence[PathLike] = (),
+    inputs: Sequence[PathLike] = (),
 ) -> bool:
-    """Refuse to replace files that nobody asked to replace.
+    """Refuse to replace files that nobody asked to replace, and those that are read.
 
     Parameters
     ----------
@@ -33,7 +35,10 @@ def may_write(
     resume : bool, optional
         Whether a run that is there may be resumed; None where the file holds no run.
     beside : sequence of path-like
-        Files that are rebuilt with it, such as the page of a run.
+        Files that are rebuilt with it, such as the page of a run. Whether those of a run that is
+        resumed may be replaced is asked of `marks.may_replace`.
+    inputs : sequence of path-like, optional
+        Files that are read: they are not replaced, whatever the choices.
 
     Returns
     -------
@@ -43,7 +48,8 @@ def may_write(
     Raises
     ------
     InputError
-        A file exists, and neither choice allows it; or both choices are made.
+        A file exists, and neither choice allows it; a file is one that is read, under whatever
+        name; or both choices are made.
 
     Examples
     --------
@@ -59,6 +65,13 @@ def may_write(
             f"{path}: got both --resume and --overwrite, expected one: resume what is there, or "
             "replace it"
         )
+    for read in inputs:
+        for place in (path, *beside, *hidden(Path(path))):
+            if _same(place, read):
+                raise InputError(
+                    f"{place}: got a file that is read, expected another to write: rename it, or "
+                    "write elsewhere"
+                )
     resumed = bool(resume) and os.path.lexists(path)
     for place in () if overwrite or resumed else (path, *beside):
         if os.path.lexists(place):
@@ -68,6 +81,58 @@ def may_write(
                 "it with --overwrite"
             )
     return resumed
+
+
+def hidden(path: Path) -> tuple[Path, Path, Path]:
+    """Name what the writer of a chain or a study uses: the lock, its holder, a temporary file.
+
+    Parameters
+    ----------
+    path : Path
+        The chain or the table.
+
+    Returns
+    -------
+    lock, holder, temporary : Path
+
+    Examples
+    --------
+    >>> [path.name for path in hidden(Path("run.h5"))]
+    ['.run.h5.lock', '.run.h5.writer', '.run.h5.tmp']
+    """
+    lock, holder, temporary = (
+        path.with_name(f".{path.name}.{kind}") for kind in ("lock", "writer", "tmp")
+    )
+    return lock, holder, temporary
+
+
+def require_plain(*places: Path) -> None:
+    """Refuse links and folders in the places of files.
+
+    Parameters
+    ----------
+    *places : Path
+        Where files are to be written.
+
+    Raises
+    ------
+    InputError
+        One of them is a link or a folder.
+    """
+    for place in places:
+        if os.path.islink(place) or os.path.isdir(place):
+            raise InputError(
+                f"{place}: got a link or a folder, expected a file or nothing there: remove it, or "
+                "write elsewhere"
+            )
+
+
+def _same(place: PathLike, read: PathLike) -> bool:
+    """Whether two paths lead to one file: equal, or by links of either kind."""
+    try:
+        return os.path.samefile(place, read)
+    except (OSError, ValueError):  # one is not there
+        return False
 
 
 def resolve(path: PathLike, run_file: PathLike, *, must_exist: bool = False) -> Path:

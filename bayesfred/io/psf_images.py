@@ -19,6 +19,7 @@ from astropy.utils.exceptions import AstropyWarning
 from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.atomic import replace
+from bayesfred.io.marks import fits_mark
 from bayesfred.io.paths import may_write
 from bayesfred.io.reading import require_file
 
@@ -40,6 +41,7 @@ def write_psf(
     numbers: Mapping[str, float],
     *,
     overwrite: bool = False,
+    run: str | None = None,
 ) -> None:
     """Write a measured PSF.
 
@@ -54,6 +56,8 @@ def write_psf(
         `oversampling`, `field_radius`, `determined`, `model_error`.
     overwrite : bool
         Replace a file that exists.
+    run : str, optional
+        The run that makes the file, see `marks`.
 
     Raises
     ------
@@ -71,8 +75,13 @@ def write_psf(
         for name in (_COEFFICIENTS, _DRAWS)
         if arrays[name.lower()] is not None
     ]
+    file = fits.HDUList([primary, *extensions])
+    if run is not None:
+        buffer = io.BytesIO()
+        file.writeto(buffer)
+        primary.header.update(fits_mark(buffer.getvalue(), run))
     buffer = io.BytesIO()
-    fits.HDUList([primary, *extensions]).writeto(buffer, checksum=True)
+    file.writeto(buffer, checksum=True)
     replace(path, buffer.getvalue())
 
 

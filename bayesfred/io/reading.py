@@ -1,4 +1,7 @@
-"""What every reader of files needs: that the file is there, and one line where it is damaged."""
+"""What every reader of files needs.
+
+That the file is there, its lines, and one line where it is damaged.
+"""
 
 import contextlib
 import os
@@ -7,7 +10,7 @@ from pathlib import Path
 
 from bayesfred.errors import InputError
 
-__all__ = ["readable", "require_file"]
+__all__ = ["read_lines", "readable", "require_file"]
 
 
 def require_file(path: Path) -> None:
@@ -16,6 +19,27 @@ def require_file(path: Path) -> None:
         raise InputError(f"{path}: no such file, expected one to read; check the path")
     if not path.is_file():
         raise InputError(f"{path}: not a file, expected one to read; check the path")
+
+
+def read_lines(path: Path) -> list[str]:
+    r"""The lines of a text file, without their ends.
+
+    Line ends alone separate them. `str.splitlines` also splits at a vertical tab or at U+2028,
+    which may be in a name.
+
+    Parameters
+    ----------
+    path : Path
+        In UTF-8, with or without a byte order mark; lines end with \n, \r\n or, in a file without
+        \n, \r.
+
+    Returns
+    -------
+    list of str
+    """
+    text = path.read_bytes().decode("utf-8-sig")
+    text = text.replace("\r\n", "\n") if "\n" in text else text.replace("\r", "\n")
+    return text.removesuffix("\n").split("\n")
 
 
 @contextlib.contextmanager

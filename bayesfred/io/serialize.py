@@ -20,6 +20,7 @@ check what they are given.
 
 import inspect
 import math
+import re
 import reprlib
 import types
 from collections.abc import Callable, Mapping
@@ -37,6 +38,8 @@ from bayesfred.io.hdf5_checks import REMEDY
 __all__ = ["kinds", "read", "serializable", "write", "write_array"]
 
 T = TypeVar("T")
+
+KEY = re.compile(r"\w[\w-]*")  # of a mapping, or several joined by dots
 
 LARGEST_CHUNK = 2**24  # bytes
 TAGS = ("kind", "keys")  # names that no field has
@@ -226,8 +229,11 @@ def _put_array(group: Any, name: str, value: Any) -> Any:
 
 def _put_mapping(group: Any, value: Mapping[str, Any]) -> None:
     for key in value:
-        if key in TAGS or not all(part.isidentifier() for part in str(key).split(".")):
-            raise InputError(f"{key}: got a key that files cannot hold, expected an identifier")
+        if key in TAGS or not all(KEY.fullmatch(part) for part in str(key).split(".")):
+            raise InputError(
+                f"{key}: got a key that files cannot hold, expected letters, digits, "
+                "underscores and hyphens"
+            )
     group.attrs["kind"] = _text(MAPPING)
     group.attrs["keys"] = np.array([_text(key) for key in value], dtype="S")
     for key, item in value.items():

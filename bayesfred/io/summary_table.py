@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from astropy.table import Table
+import numpy as np
+from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 __all__ = ["Table", "make_table"]
@@ -32,3 +33,36 @@ def make_table(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Table:
         if table[name].dtype.kind == "f":
             table[name].info.format = ".6g"  # as printed; the numbers keep their digits
     return table
+
+
+def stacked(tables: Mapping[str, Table], key: str) -> Table:
+    """Put tables below each other, with a first column that says where a row is from.
+
+    Parameters
+    ----------
+    tables : mapping of str to Table
+        They need not have the same columns: what one lacks is nan or empty there.
+    key : str
+        Name of the column.
+
+    Returns
+    -------
+    astropy.table.Table
+
+    Examples
+    --------
+    >>> one = make_table({"x": [1.0, 2.0]})
+    >>> both = stacked({"a": one, "b": one[:1]}, "frame")
+    >>> list(both["frame"]), both["x"].tolist()
+    (['a', 'a', 'b'], [1.0, 2.0, 1.0])
+    """
+    parts = []
+    for name, table in tables.items():
+        part = Table(table, copy=True)
+        part.add_column([name] * len(part), name=key, index=0)
+        parts.append(part)
+    found = vstack(parts, metadata_conflicts="silent")
+    for name in found.colnames:
+        if np.ma.isMaskedArray(found[name]):
+            found[name] = found[name].filled("" if found[name].dtype.kind in "US" else np.nan)
+    return make_table({name: found[name].data for name in found.colnames})

@@ -83,17 +83,9 @@ class FrameLikelihood:
     extrapolation: FluxExtrapolation | None = None
 
     def log_likelihood(self, vectors: Floats, wanted: Flags) -> Floats:
-        """Log-likelihood of parameter vectors, in as many threads as numba may use.
+        """Log-likelihood of n vectors, shape (n, d), in as many threads as numba may use.
 
-        Parameters
-        ----------
-        vectors : ndarray, shape (n, d)
-        wanted : ndarray of bool, shape (n,)
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            -inf where it is not wanted, or where the distortion has no density.
+        It is -inf where it is not `wanted`, shape (n,), or where the distortion has no density.
         """
         out = np.where(wanted, 0.0, -np.inf)
         arguments = self._arguments(vectors)
@@ -110,15 +102,7 @@ class FrameLikelihood:
     def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
         """The same likelihood, evaluated several times faster around `params` if fluxes are free.
 
-        Parameters
-        ----------
-        params : ndarray, shape (d,)
-        covariance : ndarray, shape (d, d)
-            How far around.
-
-        Returns
-        -------
-        FrameLikelihood
+        See `Posterior.near`.
         """
         if self.nuisances.profiled != 1:
             return self
@@ -130,7 +114,16 @@ class FrameLikelihood:
         extrapolation = flux_extrapolation(
             self.model, self.fluxes, rendered, z[:, 0], params, covariance
         )
-        return replace(self, extrapolation=extrapolation)
+        close = replace(self, extrapolation=extrapolation)
+        # what is made of a frame is large
+        vars(close).update({name: made for name, made in vars(self).items() if name[0] == "_"})
+        return close
+
+    def share_workspaces(self, other: "FrameLikelihood") -> None:
+        """Use another's workspaces where its frame is of the same kind: they are large."""
+        same = self.mask.shape == other.mask.shape
+        if same and self.nuisances.profiled == other.nuisances.profiled:
+            vars(self)["_workspaces"] = other._workspaces
 
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
@@ -162,11 +155,11 @@ class FrameLikelihood:
         return np.asarray(change.T @ out @ change)
 
     def expected_counts(self, params: Floats) -> Floats:
-        """Expected counts of every pixel, shape (ny, nx), fluxes at their most likely values."""
+        """Expected counts: see `Posterior.expected_counts`."""
         return self._expected(params)[0]
 
     def fluxes(self, params: Floats) -> Floats:
-        """Flux of every source, counts: the catalogue's, scaled, or the most likely ones."""
+        """Flux of every source, counts: see `Posterior.fluxes`."""
         return self._expected(params)[1]
 
     def own_pixels(self, params: Floats, radius: float) -> tuple[OwnPixels, Floats, Floats, Floats]:
@@ -258,8 +251,8 @@ class FrameLikelihood:
         ny, nx = self.model.detector.shape
         with self._rendered(params) as (w, rendered, parameters):
             sources = w.image.reshape(ny, -1)[:, :nx].copy()
-        bad = 0.0 if rendered.extra > -np.inf else np.nan
         level = polynomial_background(self.mask.shape, parameters.background)
+        bad = 0.0 if rendered.extra > -np.inf else np.nan
         return sources + level + bad, rendered.fluxes + bad
 
     def image_positions(self, params: Floats) -> Floats:

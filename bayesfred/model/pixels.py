@@ -2,13 +2,18 @@
 
 import numpy as np
 import numpy.typing as npt
+from scipy import spatial
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.io.memory import require_room
 from bayesfred.model.noise import Noise
 from bayesfred.model.parameters import BACKGROUND_POWERS, Nuisances
+
+OVERLAP = 12.0  # PSF widths beyond which sources have nothing to do with one another
+BYTES_A_PAIR = 200.0  # that overlaps, in the search for the maximum
 
 
 def usable_pixels(
@@ -44,19 +49,32 @@ def usable_pixels(
             raise InputError(f"{name}: got shape {array.shape}, expected the detector's {shape}")
     ny, nx = model.detector.fine_shape
     sources = model.sources
-    if not np.any((np.abs(sources.x) <= 0.5 * nx) & (np.abs(sources.y) <= 0.5 * ny)):
+    inside = int(np.sum((np.abs(sources.x) <= 0.5 * nx) & (np.abs(sources.y) <= 0.5 * ny)))
+    if not inside:
         raise InputError(
             f"catalogue: got {len(sources)} sources, all outside the frame of {nx} x {ny} pixels, "
             "expected positions in pixels from the frame's middle: check the columns, their unit "
             "and their origin"
         )
+    positions = np.stack([sources.x, sources.y], axis=1)
+    tree = spatial.cKDTree(positions)
+    pairs = (int(tree.count_neighbors(tree, OVERLAP * model.psf.sigma)) - len(sources)) // 2
+    require_room(
+        f"catalogue: got {pairs} pairs of sources that overlap, whose fit",
+        BYTES_A_PAIR * pairs,
+        "leave out the faintest, or merge sources that the PSF does not separate",
+    )
     if nuisances.footprint is not None:
-        positions = np.stack([sources.x, sources.y], axis=1)
         used &= footprints(model.detector, positions, nuisances.footprint)
     if not used.any():
         raise InputError(
             "counts: every pixel is masked, expected pixels to fit: check the mask and the "
             "footprint"
+        )
+    if nuisances.flux == "free" and inside > used.sum():
+        raise InputError(
+            f"nuisances: flux: got {inside} free fluxes in the frame and {used.sum()} pixels, "
+            "expected fewer fluxes than pixels: leave out the faintest sources"
         )
     n_bad = int(np.sum(used & ~np.isfinite(counts)))
     if n_bad:

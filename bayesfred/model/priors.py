@@ -126,6 +126,11 @@ def make(name: str, family: str, parameters: Mapping[str, float]) -> Any:
     return distribution
 
 
+def same(one: Any, other: Any) -> bool:
+    """Whether two distributions are of one family with the same parameters."""
+    return bool(one.dist.name == other.dist.name and _standard(one) == _standard(other))
+
+
 def slope(distribution: Any, x: float) -> tuple[float, float]:
     """Derivative of the log-density at x, and minus its second derivative."""
     shapes, loc, scale = _standard(distribution)

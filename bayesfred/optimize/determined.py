@@ -3,7 +3,9 @@
 import numpy as np
 
 from bayesfred._typing import Floats
+from bayesfred.errors import InputError
 from bayesfred.model import priors
+from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.posterior import Posterior
 
 # A combination of parameters about which the frame adds less than this share to its prior's
@@ -12,6 +14,25 @@ LEAST_INFORMATION = 0.01
 
 # ... nor is it missed if it makes up less than this share of what its priors allow.
 LEAST_EFFECT = 0.01
+
+
+def require_light(posterior: Posterior) -> None:
+    """Refuse a frame that says nothing: one number in every pixel, or not a photon in any.
+
+    Raises
+    ------
+    InputError
+    """
+    counts = posterior.counts[posterior.mask]
+    low, high = float(counts.min()), float(counts.max())
+    if (low == high and counts.size > 1) or (
+        isinstance(posterior.noise, PoissonNoise) and high < 1
+    ):
+        got = f"{high:g} in each" if low == high else f"at most {high:.2g}"
+        raise InputError(
+            f"counts: got {got} of {counts.size} pixels, expected images of the sources: such a "
+            "frame holds no information: check the exposure and the gain"
+        )
 
 
 def undetermined(posterior: Posterior, params: Floats, fisher: Floats) -> tuple[str, ...]:

@@ -5,17 +5,20 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
-from bayesfred.optimize.determined import undetermined
-from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.determined import require_light, undetermined
+from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
+from bayesfred.optimize.joint_map import maximize_frames
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.modes import ModeSearch, find_modes
 from bayesfred.optimize.newton import NewtonResult, maximize
@@ -26,6 +29,9 @@ from bayesfred.optimize.starts import Start, find_start, other_starts
 # of its error.
 CLOSENESS = 1e-3
 
+Frames = TypeVar("Frames", Posterior, JointPosterior)
+
+MOST_NAMED = 3  # frames
 STEPS = 8  # of Newton's method where the maximum itself is not wanted
 
 NO_DENSITY = (
@@ -49,7 +55,7 @@ def find_map(
 
     Parameters
     ----------
-    posterior : Posterior, or another TargetDensity with a start
+    posterior : Posterior, JointPosterior, or another TargetDensity with a start
     start : array_like, shape (d,), optional
         Where to begin; by default what the counts alone say: peaks matched to the catalogue, and
         other starts where no maximum is found from there, see `starts`.
@@ -61,8 +67,9 @@ def find_map(
     Raises
     ------
     InputError
-        If the start has no posterior density, or the frame cannot determine some parameters, which
-        are named; if there is no start where no frame could give one.
+        If the frame holds no information; if the start has no posterior density, or the frame
+        cannot determine some parameters, which are named; if there is no start where no frame
+        could give one.
 
     References
     ----------
@@ -80,6 +87,8 @@ def find_map(
     """
     if isinstance(posterior, Posterior):
         return _search(keep_all, posterior, start)[1]
+    if isinstance(posterior, JointPosterior):
+        return _search_frames(keep_all, posterior, start)[1]
     if start is None:
         raise InputError("start: got none, expected one for a density that is not of a frame")
     begin = np.array(start, dtype=np.float64)
@@ -90,8 +99,8 @@ def find_map(
 
 
 def reject_outliers(
-    posterior: Posterior, start: Sequence[float] | Floats | None = None
-) -> tuple[Posterior, MapEstimate]:
+    posterior: Frames, start: Sequence[float] | Floats | None = None
+) -> tuple[Frames, MapEstimate]:
     """Maximise the posterior without unmatched sources and spurious detections.
 
     Sources that are missing from the frame are taken off the catalogue; detections of no source,
@@ -100,13 +109,13 @@ def reject_outliers(
 
     Parameters
     ----------
-    posterior : Posterior
+    posterior : Posterior or JointPosterior
     start : array_like, shape (d,), optional
         Where to begin; as in `find_map`.
 
     Returns
     -------
-    posterior : Posterior
+    posterior : Posterior or JointPosterior
         The one to sample, of the sources and the pixels that remain.
     estimate : MapEstimate
         Its maximum; the message counts the rejected sources and pixels.
@@ -138,6 +147,8 @@ def reject_outliers(
     >>> estimate.fits_data, bool(kept.mask[41, 21]), len(kept.model.sources)
     (True, False, 9)
     """
+    if isinstance(posterior, JointPosterior):
+        return _search_frames(reject, posterior, start)
     return _search(reject, posterior, start)
 
 
@@ -168,6 +179,7 @@ def approach(
     InputError
         If the start has no posterior density, or the frame cannot determine some parameters.
     """
+    require_light(posterior)
     with threadpool_limits(1, user_api="blas"):
         params = find_start(posterior).params if start is None else start
         if not np.isfinite(posterior.log_prob(params)):
@@ -186,6 +198,7 @@ def _search(
     start: Sequence[float] | Floats | None,
 ) -> tuple[Posterior, MapEstimate]:
     """The posterior of what is kept, and its maximum."""
+    require_light(posterior)
     # idle BLAS threads spin, and take the cores from what is at work
     with threadpool_limits(1, user_api="blas"):
         top, evaluations = None, 0
@@ -232,26 +245,61 @@ def _starts(posterior: Posterior, start: Sequence[float] | Floats | None) -> Ite
     yield from other_starts(posterior, begun)
 
 
+def _search_frames(
+    rejecting: Callable[[Posterior, Floats], tuple[Kept, Floats, int]],
+    posterior: JointPosterior,
+    start: Sequence[float] | Floats | None,
+) -> tuple[JointPosterior, MapEstimate]:
+    """The joint posterior of what is kept of several frames, and its maximum."""
+    with threadpool_limits(1, user_api="blas"):
+        found = maximize_frames(posterior, rejecting, start)
+        joint, top = found.posterior, found.top
+        judged = [
+            _fits(posterior.frames[name], kept, joint.frame_params(name, top.params))
+            for name, kept in found.kept.items()
+        ]
+    wrong = [
+        f"{name}{how}; {advice}"
+        for name, ((fits, advice), how) in zip(found.kept, judged, strict=True)
+        if not fits
+    ]
+    more = f"; and {len(wrong) - MOST_NAMED} more frames" if len(wrong) > MOST_NAMED else ""
+    how, advice = f", {len(judged)} frames", "; ".join(wrong[:MOST_NAMED]) + more
+    estimate = _estimate(joint, top, found.evaluations, how, (not wrong, advice))
+    if found.several:
+        one = Modes(top.params[None], top.covariance[None], np.ones(1), 1, complete=False)
+        said = f"{estimate.message}; other modes of {', '.join(found.several)}"
+        estimate = replace(estimate, modes=one, message=said)
+    return joint, estimate
+
+
 def _judged(
     given: Posterior, kept: Kept, search: ModeSearch, evaluations: int, path: str
 ) -> MapEstimate:
     """The maximum of what is kept of the given posterior, and whether the model fits there."""
     posterior, top = kept.posterior, search.top
-    light, sources = source_light(posterior, top.params), len(posterior.model.sources)
-    how = f"{path and f' from {path}'}, {light.matched.sum()} of {sources} sources matched"
-    fit, rejecting = fit_statistics(posterior, top.params), posterior is not given
-    if rejecting:
-        pixels = given.mask.sum() - posterior.mask.sum()
-        how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
+    judged, how = _fits(given, kept, top.params)
+    how = f"{path and f' from {path}'}{how}"
     if search.modes is not None and search.modes.count > 1:
         first, second = search.modes.weights[:2]
         how += f", {search.modes.count} modes, the largest with {first:.0%} and {second:.0%}"
-    enough = enough_matched(posterior, light)
-    judged = consistent(fit) and enough, _advice(fit, enough, rejecting)
-    if kept.share > BREAKDOWN:
-        judged = False, MOSTLY_REJECTED
     estimate = _estimate(posterior, top, evaluations, how, judged)
     return replace(estimate, modes=search.modes)
+
+
+def _fits(given: Posterior, kept: Kept, params: Floats) -> tuple[tuple[bool, str], str]:
+    """Whether what is kept of a frame fits, with advice, and how many sources are matched."""
+    posterior = kept.posterior
+    light, sources = source_light(posterior, params), len(posterior.model.sources)
+    how = f", {light.matched.sum()} of {sources} sources matched"
+    fit, rejecting = fit_statistics(posterior, params), posterior is not given
+    if rejecting:
+        pixels = given.mask.sum() - posterior.mask.sum()
+        how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
+    enough = enough_matched(posterior, light)
+    if kept.share > BREAKDOWN:
+        return (False, MOSTLY_REJECTED), how
+    return (consistent(fit) and enough, _advice(fit, enough, rejecting)), how
 
 
 def _estimate(
@@ -275,7 +323,7 @@ def _estimate(
         message = f"not found, {message}: {remedy}"
     else:
         message = f"found, {message}{advice and f'; {advice}'}"
-    errors = posterior.psf_errors if isinstance(posterior, Posterior) else None
+    errors = getattr(posterior, "psf_errors", None)
     covariance = top.covariance if errors is None else top.covariance + errors.covariance
     return MapEstimate(top.params, covariance, top.log_prob, evaluations, message, at_maximum, fits)
 

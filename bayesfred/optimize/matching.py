@@ -17,6 +17,7 @@ from scipy import linalg, spatial
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.geometry import image_positions
+from bayesfred.model.pixels import OVERLAP
 from bayesfred.model.posterior import Posterior
 
 CENTROID = 0.2  # error of a peak's position that is taken for granted, in PSF widths
@@ -38,7 +39,7 @@ def _alone(model: ForwardModel) -> Flags:
     """
     s = model.sources
     position = np.stack([s.x, s.y], axis=1)
-    far = 12.0 * model.psf.sigma  # exp(-36) is nothing
+    far = OVERLAP * model.psf.sigma  # exp(-36) is nothing
     pairs = spatial.cKDTree(position).query_pairs(far, output_type="ndarray")
     source, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     d = position[other] - position[source]

@@ -15,9 +15,16 @@ from bayesfred._typing import PathLike
 from bayesfred.analysis.comparison import Comparison
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.io import atomic
+from bayesfred.model.joint import JointPosterior
 from bayesfred.reporting.figures import PageFigure, described_residual
 from bayesfred.reporting.frames import FittedFrame, residual_panels
-from bayesfred.reporting.html import described_model, embedded_figures, made_text, render
+from bayesfred.reporting.html import (
+    described_frames,
+    described_model,
+    embedded_figures,
+    made_with,
+    render,
+)
 from bayesfred.reporting.labels import html_symbol, html_unit, scale_of
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.record import RunRecord
@@ -47,12 +54,13 @@ class ComparedRun:
         """What the page says of the run alone."""
         chain = self.chain
         record = chain.record or RunRecord(Path(self.name).stem)
-        made = f"{made_text(record)}, " if chain.record else ""
+        posterior = chain.posterior()
+        several = isinstance(posterior, JointPosterior)
         return {
             "name": self.name,
             "title": record.title or Path(self.name).stem,
-            "model": described_model(record, chain.posterior()),
-            "made": f"{made}bayesfred {chain.versions['bayesfred']}",
+            "model": described_frames(posterior) if several else described_model(record, posterior),
+            "made": made_with(chain),
             "diagnostics": self.diagnostics,
         }
 
@@ -96,7 +104,7 @@ def write_comparison(
         number=number,
         rows=[_row(name, runs) for name in common],
         others=[[name for name in own if name not in common] for own in names],
-        figures=embedded_figures([_residuals(runs)]),
+        figures=embedded_figures(_residuals(runs)),
     )
     atomic.replace(path, page)
     return path
@@ -123,11 +131,16 @@ def _row(name: str, runs: Sequence[ComparedRun]) -> dict[str, Any]:
     }
 
 
-def _residuals(runs: Sequence[ComparedRun]) -> PageFigure:
+def _residuals(runs: Sequence[ComparedRun]) -> list[PageFigure]:
+    """Residuals of every run; those of several frames are on the frames' own pages."""
+    if any(isinstance(run.chain.posterior(), JointPosterior) for run in runs):
+        return []
     fitted = [FittedFrame.at(run.chain.posterior(), run.chain.estimate.params) for run in runs]
-    return PageFigure(
-        "Residuals",
-        "At each run's MAP, on one scale. Green pixels do not enter the likelihood.",
-        " ".join(f"Run {k}: {described_residual(frame)}" for k, frame in enumerate(fitted, 1)),
-        residual_panels(fitted),
-    )
+    return [
+        PageFigure(
+            "Residuals",
+            "At each run's MAP, on one scale. Green pixels do not enter the likelihood.",
+            " ".join(f"Run {k}: {described_residual(frame)}" for k, frame in enumerate(fitted, 1)),
+            residual_panels(fitted),
+        )
+    ]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -22,16 +23,33 @@ from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.errors import printable
 from bayesfred.io import atomic
+from bayesfred.io.marks import marked
 from bayesfred.io.summary_table import Table
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.figures import PageFigure
-from bayesfred.reporting.labels import html_symbol, html_unit, scale_of, with_error
+from bayesfred.reporting.labels import (
+    html_symbol,
+    html_symbols,
+    html_unit,
+    scale_of,
+    with_error,
+)
 from bayesfred.reporting.style import embedded
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.record import RunRecord
 
-__all__ = ["described_model", "embedded_figures", "made_text", "render", "write_report"]
+__all__ = [
+    "described_frames",
+    "described_model",
+    "embedded_figures",
+    "made_with",
+    "parameter_rows",
+    "provenance",
+    "render",
+    "write_report",
+]
 
 LEVELS = (0.025, 0.16, 0.84, 0.975)  # of the intervals of 68 % and 95 %
 
@@ -66,6 +84,7 @@ def write_report(
     diagnostics: Diagnostics,
     figures: Sequence[PageFigure] = (),
     result: str | None = None,
+    home: Path | None = None,
 ) -> Path:
     """Write the report of a run as one HTML file, in one step: the old page stays until then.
 
@@ -84,6 +103,8 @@ def write_report(
         In the page's order.
     result : str, optional
         A sentence with what was found, which leads the page.
+    home : Path, optional
+        The page of all frames, beside this one.
 
     Returns
     -------
@@ -97,13 +118,7 @@ def write_report(
     """
     path = Path(path)
     posterior, record = chain.posterior(), chain.record or RunRecord(path.stem)
-    parameters = {p.name: p for p in posterior.parameters}
-    levels = dict(
-        zip(chain.parameter_names, np.quantile(chain.draws(), LEVELS, axis=0).T, strict=True)
-    )
-    made = "bayesfred " + chain.versions["bayesfred"]
-    if chain.record:
-        made = f"{made_text(record)}, {made}"
+    made = made_with(chain)
     heading, subtitle = record.title or path.stem, described_model(record, posterior)
     page = render(
         "run.html",
@@ -111,23 +126,58 @@ def write_report(
         heading=heading,
         subtitle=subtitle,
         made=made,
+        home=home and quote(home.name),
         result=result,
         diagnostics=diagnostics,
         causes=diagnostics.causes,
-        rows=[_row(dict(row), parameters[row["name"]], levels[row["name"]]) for row in summary],
-        prior_dominated=Markup(", ").join(
-            html_symbol(parameters[name]) for name in diagnostics.prior_dominated
-        ),
+        rows=parameter_rows(chain, summary),
+        prior_dominated=html_symbols(diagnostics.prior_dominated, posterior.parameters),
         has_truth="truth" in summary.colnames,
         has_robust="robust_sd" in summary.colnames,
         statistics=_statistics(diagnostics),
         figures=embedded_figures(figures),
-        provenance=_provenance(chain, diagnostics),
-        notes=record.notes,
-        settings=_lines(record.settings or ""),
+        **provenance(chain, diagnostics),
     )
-    atomic.replace(path, page)
+    atomic.replace(path, marked(page, chain.identity))
     return path
+
+
+def parameter_rows(chain: Chain, summary: Table) -> list[dict[str, str]]:
+    """The rows of the table of parameters, as the templates take them.
+
+    Parameters
+    ----------
+    chain : Chain
+    summary : astropy.table.Table
+        Of all its parameters, or of some.
+
+    Returns
+    -------
+    list of dict
+    """
+    parameters = {p.name: p for p in chain.posterior().parameters}
+    levels = dict(
+        zip(chain.parameter_names, np.quantile(chain.draws(), LEVELS, axis=0).T, strict=True)
+    )
+    return [_row(dict(row), parameters[row["name"]], levels[row["name"]]) for row in summary]
+
+
+def made_with(chain: Chain) -> str:
+    """When a run was made, if that is known, and with which version.
+
+    Parameters
+    ----------
+    chain : Chain
+
+    Returns
+    -------
+    str
+        Such as "2026-11-22 04:00 UTC, bayesfred 0.1.0".
+    """
+    made = f"bayesfred {chain.versions['bayesfred']}"
+    if chain.record is None:
+        return made
+    return f"{datetime.fromisoformat(chain.record.made):%Y-%m-%d %H:%M} UTC, {made}"
 
 
 def render(template: str, **values: Any) -> bytes:
@@ -178,25 +228,6 @@ def embedded_figures(figures: Sequence[PageFigure]) -> list[dict[str, Any]]:
     return [{**f._asdict(), "image": embedded(f.figure)} for f in figures]
 
 
-def made_text(record: RunRecord) -> str:
-    """Date and time of a run.
-
-    Parameters
-    ----------
-    record : RunRecord
-
-    Returns
-    -------
-    str
-
-    Examples
-    --------
-    >>> made_text(RunRecord(made="2026-11-22T04:00:17+00:00"))
-    '2026-11-22 04:00 UTC'
-    """
-    return f"{datetime.fromisoformat(record.made):%Y-%m-%d %H:%M} UTC"
-
-
 def described_model(record: RunRecord, posterior: Posterior) -> str:
     """The frame and its model in words.
 
@@ -222,6 +253,23 @@ def described_model(record: RunRecord, posterior: Posterior) -> str:
     ]
     names = [name.replace("_", " ") for name in free.names]
     return ", ".join(parts) + (f"; also free: {', '.join(names)}" if names else "")
+
+
+def described_frames(posterior: JointPosterior) -> str:
+    """What several frames share, in words.
+
+    Parameters
+    ----------
+    posterior : JointPosterior
+
+    Returns
+    -------
+    str
+    """
+    return (
+        f"{len(posterior.frames)} frames of one instrument; of {posterior.n_parameters} parameters "
+        f"they share {posterior.n_shared}"
+    )
 
 
 def _words(value: Any) -> str:
@@ -289,6 +337,26 @@ def _number(value: float) -> str:
     return _minus(f"{value:.1f}" if abs(value) >= 100.0 else f"{value:.3g}")
 
 
+def provenance(chain: Chain, diagnostics: Diagnostics) -> dict[str, Any]:
+    """Where a run's draws are from, its notes and its settings, as the templates take them.
+
+    Parameters
+    ----------
+    chain : Chain
+    diagnostics : Diagnostics
+
+    Returns
+    -------
+    dict
+    """
+    record = chain.record or RunRecord()
+    return {
+        "provenance": _provenance(chain, diagnostics),
+        "notes": record.notes,
+        "settings": _lines(record.settings or ""),
+    }
+
+
 def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     n_ensembles, n_steps, n_walkers, d = chain.chain.shape
     drawn = f"{diagnostics.n_draws} of {d} parameters, "
@@ -307,10 +375,7 @@ def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]
         *how,
         ("MAP", f"{chain.estimate.message} ({chain.estimate.n_evaluations} evaluations)"),
         ("pixels used", str(diagnostics.n_pixels)),
-        (
-            "versions",
-            ", ".join(f"{name} {version}" for name, version in sorted(chain.versions.items())),
-        ),
+        ("versions", chain.made_with),
     ]
 
 

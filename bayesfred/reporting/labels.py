@@ -4,6 +4,7 @@ What a parameter is comes from `bayesfred.model.parameters`, never from its name
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ __all__ = [
     "Scale",
     "axis_label",
     "html_symbol",
+    "html_symbols",
     "html_unit",
     "math_symbol",
     "power_of_ten",
@@ -198,6 +200,21 @@ def html_symbol(parameter: Parameter) -> Markup:
         return Markup("{}").format(printable(parameter.name.replace("_", " ")))
     powers = Markup("").join(_raised(variable, power) for variable, power in parameter.powers)
     return Markup("<i>{}</i><sub>{}</sub>").format(parameter.letter, powers)
+
+
+def html_symbols(names: Sequence[str], parameters: Sequence[Parameter]) -> Markup:
+    """The symbols of those of the parameters that are named, for the page.
+
+    Parameters
+    ----------
+    names : sequence of str
+    parameters : sequence of Parameter
+
+    Returns
+    -------
+    Markup
+    """
+    return Markup(", ").join(html_symbol(p) for p in parameters if p.name in names)
 
 
 def html_unit(parameter: Parameter, exponent: int) -> Markup:

@@ -145,7 +145,11 @@ def corner_plot(
         (estimate, ESTIMATE_COLOUR, "--", "MAP"),
     ):
         if values is not None:
-            corner.overplot_lines(fig, values / scale, color=colour, linestyle=style, linewidth=0.9)
+            look: dict[str, Any] = {"color": colour, "linestyle": style, "linewidth": 0.9}
+            if d == 1:  # which corner cannot mark
+                fig.axes[0].axvline(values[0] / scale[0], **look)
+            else:
+                corner.overplot_lines(fig, values / scale, **look)
             marked.append((label, colour, style))
     for ax in fig.axes:
         ax.tick_params(labelsize=8 if small else 8.5, length=2, pad=1.5)

@@ -24,6 +24,7 @@ __all__ = [
     "check_table",
     "comparison_table",
     "cross_check_table",
+    "frame_table",
     "parameter_table",
     "study_table",
 ]
@@ -83,6 +84,40 @@ def parameter_table(summary: Any, width: int) -> Table:
         _Column("R-hat", numbers("rhat", ".3f"), 5),
         _Column("ESS", [f"{ess:.0f}" if np.isfinite(ess) else "" for ess in least], 3),
         _Column("prior", numbers("prior_sensitivity", ".3f"), 7),
+    ]
+    return _table([column for column in columns if any(column.cells)], width)
+
+
+def frame_table(frames: Any, width: int) -> Table:
+    """Lay out the table of frames: how each fits, and whether it agrees with the others.
+
+    Parameters
+    ----------
+    frames : astropy.table.Table
+        See `JointResult.frame_table`.
+    width : int
+        Characters in a line. Where they do not suffice, columns are left out: agreement p
+        first, then pixels, sources and times.
+
+    Returns
+    -------
+    rich.table.Table
+    """
+
+    def numbers(key: str, form: str) -> list[str]:
+        if key not in frames.colnames:
+            return []
+        return [format(value, form) if np.isfinite(value) else "" for value in frames[key]]
+
+    columns = [
+        _Column("frame", [str(name) for name in frames["frame"]], justify="left"),
+        _Column("time", numbers("time", "g"), 1),
+        _Column("sources", numbers("sources", "d"), 2),
+        _Column("pixels", numbers("pixels", "d"), 3),
+        _Column("deviance z", numbers("deviance_z", "+.1f")),
+        _Column("fits", ["yes" if fits else "no" for fits in frames["fits_data"]]),
+        _Column("agreement p", numbers("agreement_p", ".2g"), 4),
+        _Column("agrees", ["yes" if agrees else "no" for agrees in frames["agrees"]]),
     ]
     return _table([column for column in columns if any(column.cells)], width)
 

@@ -3,7 +3,8 @@
 `sampler.sample` makes a `Chain`; `chainfile` writes one to a file and reads it back.
 """
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,9 @@ import numpy.typing as npt
 import xarray as xr
 
 from bayesfred._typing import Floats, Ints
+from bayesfred.errors import InputError
 from bayesfred.io.summary_table import Table
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.datatree import to_datatree
@@ -50,7 +53,7 @@ class Chain:
     estimate : MapEstimate
         The maximum that the proposals are centred on.
     versions : dict of str to str
-        Versions of the packages that made the run.
+        Versions of the packages that made the run, the last of its steps where it was resumed.
     target_ess : float
         The number of effective draws that was asked for.
     n_invalid : int
@@ -60,6 +63,11 @@ class Chain:
         see `laplace`.
     record : RunRecord or None
         Title, frame, settings, notes and truth of the run, where they were given.
+    whole : Chain or None
+        Of a frame among several, see `frame`: the chain of all.
+    earlier : tuple of (int, dict of str to str)
+        Of a run that was resumed with other versions: the number of steps that there were then, and
+        the versions that had made the last of them.
     """
 
     path: Path | None
@@ -76,11 +84,36 @@ class Chain:
     n_invalid: int = 0
     method: Method = "mcmc"
     record: RunRecord | None = None
+    whole: "Chain | None" = field(default=None, repr=False)
+    earlier: tuple[tuple[int, dict[str, str]], ...] = ()
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the last axis of `chain`; length d."""
         return self.density.parameter_names
+
+    @property
+    def identity(self) -> str:
+        """What the run is known by, whatever became of it since: a hash of its first step.
+
+        It is that of posterior, estimate, seed and walkers, on the machine that began the run. One
+        of several frames is known by the run of all.
+        """
+        if self.whole is not None:
+            return self.whole.identity
+        return hashlib.sha256(self.chain[:, 0].tobytes()).hexdigest()[:32]
+
+    @property
+    def made_with(self) -> str:
+        """The versions as a text; where the run was resumed with others, what they were before."""
+        names = [f"{name} {version}" for name, version in sorted(self.versions.items())]
+        before = [
+            f"; until step {steps} {name} {versions.get(name, 'not there')}"
+            for steps, versions in self.earlier
+            for name in sorted({**versions, **self.versions})
+            if versions.get(name) != self.versions.get(name)
+        ]
+        return ", ".join(names) + "".join(before)
 
     def posterior(self) -> Any:
         """The posterior that was sampled: of frames a `Posterior`, or what `sample` was given.
@@ -88,6 +121,51 @@ class Chain:
         The chain holds it. What happens to the file afterwards does not change it.
         """
         return self.density
+
+    def frame(self, name: str) -> "Chain":
+        """What a chain of several frames says of one of them: draws of its own posterior.
+
+        They are marginal: the other frames have narrowed what is shared. So the log-densities are
+        those of all frames, and `whole` is the chain of all.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        Chain
+
+        Raises
+        ------
+        InputError
+            If the chain is not of several frames, or has no such frame.
+        """
+        joint = self.density
+        if not isinstance(joint, JointPosterior):
+            raise InputError(
+                f"frame: got {name!r}, expected a chain of several frames to pick from"
+            )
+        density, best = joint.frame(name), self.estimate
+        estimate = replace(
+            best,
+            params=joint.frame_params(name, best.params),
+            covariance=joint.frame_covariance(name, best.covariance),
+            modes=None,
+            fits_data=True,  # which is asked of every frame anew
+        )
+        record = self.record and replace(
+            self.record,
+            title=f"{self.record.title}: {name}",
+            truth=None
+            if self.record.truth is None
+            else joint.frame_params(name, self.record.truth),
+        )
+        flat = self.chain.reshape(-1, self.chain.shape[3])
+        own = joint.frame_params(name, flat).reshape(*self.chain.shape[:3], -1)
+        return replace(
+            self, density=density, chain=own, estimate=estimate, record=record, whole=self
+        )
 
     def draws(self) -> Floats:
         """All draws after burn-in, shape (n, d), parameter units.

@@ -23,6 +23,8 @@ from bayesfred.io import atomic
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
 from bayesfred.io.sealed import FORMAT
 from bayesfred.io.serialize import read, write, write_array
+from bayesfred.model.dithered import DitheredPosterior
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, Modes
@@ -104,10 +106,9 @@ def write_chain(chain: Chain) -> None:
         file.attrs["parameter_names"] = np.array(chain.parameter_names, dtype=np.bytes_)
         file.attrs.update(target_ess=chain.target_ess, n_invalid=chain.n_invalid)
         file.attrs["method"] = np.bytes_(chain.method)
-        versions = file.create_group("versions")
-        versions.attrs.update(
-            {name: np.bytes_(version) for name, version in chain.versions.items()}
-        )
+        _write_versions(file.create_group("versions"), chain.versions)
+        for steps, versions in chain.earlier:
+            _write_versions(file.create_group(f"versions/until_{steps}"), versions)
         write(file.create_group("posterior"), chain.density)
         write(file.create_group("estimate"), chain.estimate)
         if chain.estimate.modes is not None:
@@ -123,6 +124,25 @@ def write_chain(chain: Chain) -> None:
             raise InputError(
                 f"{error}: what was saved before is still there: resume from it"
             ) from None
+
+
+def _write_versions(group: Any, versions: dict[str, str]) -> None:
+    group.attrs.update({name: np.bytes_(version) for name, version in versions.items()})
+
+
+def _read_versions(group: Any) -> dict[str, str]:
+    versions = {name: version.decode() for name, version in group.attrs.items()}
+    if not all(name.isidentifier() for name in versions):
+        raise ValueError("names that are none")
+    if not all(text.isprintable() for text in versions.values()):
+        raise ValueError("texts that cannot be shown")
+    return versions
+
+
+def _earlier(group: Any) -> tuple[tuple[int, dict[str, str]], ...]:
+    """See `Chain.earlier`."""
+    ends = {int(name.removeprefix("until_")): name for name in group}
+    return tuple((steps, _read_versions(group[ends[steps]])) for steps in sorted(ends))
 
 
 def _write_ensemble(group: Any, chain: Chain, k: int, state: tuple[Any, ...]) -> None:
@@ -147,6 +167,8 @@ def _refuse_other_densities(file: h5py.File) -> None:
     approximation alone before schema 5, and positions scattered normally before schema 6.
     """
     schema = file.attrs["schema"]
+    if file["posterior"].attrs.get("kind") != b"posterior":  # of schema 8
+        return
     if file["posterior/nuisances"].attrs["flux"] == b"free" and schema < 5:
         raise InputError(
             f"nuisances: got free fluxes by Laplace's approximation (schema {schema}), expected "
@@ -173,7 +195,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
     groups = [file[f"ensemble_{k}"] for k in range(int(file.attrs["ensembles"]))]
     chain = Chain(
         path=path,
-        density=read(file["posterior"], Posterior),
+        density=_posterior(file["posterior"]),
         chain=np.stack([g["chain"][()] for g in groups]),
         log_prob=np.stack([g["log_prob"][()] for g in groups]),
         accepted=np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
@@ -181,11 +203,12 @@ def _read(path: Path, file: h5py.File) -> Chain:
         burn_in=int(file.attrs["burn_in"]),
         seed=int(file.attrs["seed"]),
         estimate=replace(read(file["estimate"], MapEstimate), modes=modes),
-        versions={name: version.decode() for name, version in file["versions"].attrs.items()},
+        versions=_read_versions(file["versions"]),
         target_ess=float(file.attrs["target_ess"]),
         n_invalid=int(file.attrs["n_invalid"]),
         method=_method(file.attrs.get("method", b"mcmc")),  # files had none before others came
         record=read(file["record"], RunRecord) if "record" in file else None,
+        earlier=_earlier(file["versions"]),
     )
     names = tuple(name.decode() for name in file.attrs["parameter_names"])
     if names != chain.parameter_names:
@@ -210,11 +233,20 @@ def _read(path: Path, file: h5py.File) -> Chain:
     steps = {int(g.attrs["iteration"]) for g in groups}
     if steps != {shape[1]} or not 0 <= chain.burn_in < shape[1]:
         raise ValueError("numbers of steps that do not agree")
-    if not all(name.isidentifier() for name in chain.versions):
-        raise ValueError("names that are none")
-    if not all(text.isprintable() for text in (chain.estimate.message, *chain.versions.values())):
+    if not all(0 < steps < shape[1] for steps, _ in chain.earlier):
+        raise ValueError("versions of steps that there are not")
+    if not chain.estimate.message.isprintable():
         raise ValueError("texts that cannot be shown")
     return chain
+
+
+def _posterior(group: Any) -> Posterior | JointPosterior | DitheredPosterior:
+    """The posterior of a frame or of several."""
+    if group.attrs.get("kind") == b"joint_posterior":
+        return read(group, JointPosterior)
+    if group.attrs.get("kind") == b"dithered_posterior":
+        return read(group, DitheredPosterior)
+    return read(group, Posterior)
 
 
 def _method(stored: bytes) -> Method:

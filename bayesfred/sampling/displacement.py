@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.parameters import displacing
 from bayesfred.model.posterior import Posterior
 
@@ -112,6 +113,12 @@ def frame_posterior(chain: "Chain") -> Posterior:
         If it is another density.
     """
     posterior = chain.posterior()
+    if isinstance(posterior, JointPosterior):
+        names = list(posterior.frames)
+        raise InputError(
+            f"chain: got one of the frames {', '.join(names[:5])}{', ...' * (len(names) > 5)}, "
+            f'expected that of a frame: chain.frame("{names[0]}")'
+        )
     if not hasattr(posterior, "model"):
         raise InputError(
             "chain: displacement: got draws of a density that is no frame's, expected those of a "

@@ -21,10 +21,12 @@ from typing import Any, NamedTuple
 import emcee
 import numpy as np
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.errors import InputError
+from bayesfred.model.joint import JointPosterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.frame_moves import FrameMove, Parts
 from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
@@ -76,6 +78,14 @@ class _LogProb:
 
     def __call__(self, params: Floats) -> Floats:
         values = self.posterior.log_prob(params)
+        return self._checked(values)
+
+    def parts(self, params: Floats, wanted: Flags | None) -> Floats:
+        """The parts of several frames' log-posterior."""
+        assert isinstance(self.posterior, JointPosterior), "who else has parts"
+        return self._checked(self.posterior.log_parts(params, wanted))
+
+    def _checked(self, values: Floats) -> Floats:
         invalid = ~(values < np.inf)
         self.n_invalid += int(invalid.sum())
         return np.where(invalid, -np.inf, values)
@@ -187,28 +197,40 @@ def adapted(chain: Floats) -> int:
 
 
 def _accepted(chain: Floats, look: int) -> float:
-    """Share of accepted moves in the latter half of the steps before a look."""
-    moved = np.any(np.diff(chain[:, look // 2 : look], axis=1) != 0.0, axis=3)
+    """Share of accepted moves in the latter half of the steps before a look.
+
+    Every move that is accepted changes the first parameter; of several frames it is a shared one.
+    """
+    moved = np.diff(chain[:, look // 2 : look, :, 0], axis=1) != 0.0
     return float(moved.mean())
 
 
 def moves_after(
-    posterior: TargetDensity, estimate: MapEstimate, chain: Floats
+    posterior: TargetDensity, estimate: MapEstimate, chain: Floats, log_parts: Parts | None = None
 ) -> list[tuple[emcee.moves.Move, float]]:
     """The moves that make the step after those in the chain, each with its share.
 
     Differential evolution frees walkers from positions where a likelier one is hardly ever
-    proposed. That matters in the long run only: before the first look it would only cost draws.
+    proposed. That matters in the long run only: before the first look it would only cost draws. In
+    the many dimensions of several frames it is of no use.
 
     Parameters
     ----------
     posterior : TargetDensity
     estimate : MapEstimate
     chain : ndarray, shape (ensembles, steps, walkers, d)
+    log_parts : callable, optional
+        Of several frames: that of `JointPosterior`, unless another is given.
     """
+    made = adapted(chain)
+    draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
+    if isinstance(posterior, JointPosterior):
+        parts = log_parts or posterior.log_parts
+        if made:
+            return [(FrameMove.fitted(posterior, draws, parts), 1.0)]
+        return [(FrameMove.of(posterior, estimate, parts), 1.0)]
     move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= LOOKS[0])
-    if made := adapted(chain):
-        draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
+    if made:
         share = DE_SHARE_ADAPTED
         with suppress(InputError):  # of too few draws: the next look has more
             move = LaplaceMove.fitted(posterior, estimate, draws)
@@ -245,6 +267,7 @@ def advance(
                 posterior,
                 estimate,
                 np.array(past).reshape(-1, ensembles, walkers, d).swapaxes(0, 1),
+                log_prob.parts,
             )
             generators = []
             for state in last.states():
@@ -260,7 +283,7 @@ def advance(
         states = [next(generator) for generator in generators]
         moved = np.stack(
             [
-                np.any(state.coords != before, axis=1)
+                state.coords[:, 0] != before[:, 0]
                 for state, before in zip(states, last.coords, strict=True)
             ]
         )

@@ -160,7 +160,7 @@ def importance_efficiency(chain: Chain) -> float:
     Parameters
     ----------
     chain : Chain
-        Draws that `laplace` made.
+        Draws that `laplace` made; of a frame among several those of all are judged.
 
     Returns
     -------
@@ -181,6 +181,7 @@ def importance_efficiency(chain: Chain) -> float:
     >>> importance_efficiency(laplace(posterior, seed=1, progress=False)) > 0.99
     True
     """
+    chain = chain.whole or chain
     draws, log_q = chain.chain.reshape(-1, len(chain.parameter_names)), chain.log_prob.ravel()
     chosen = np.linspace(0, len(draws) - 1, min(WEIGHTED, len(draws))).astype(int)
     log_weights = chain.density.log_prob(draws[chosen]) - log_q[chosen]

@@ -199,20 +199,22 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         stretch = np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, n))
         heavy = random.random_sample(n) < self.heavy_share
         for i in range(len(self.bounds)):
-            a, b = self._interval(i, self.means[k], self.lowers[k], z)
+            a, b = self._interval(i, self.means[k], self.lowers[k, i], z)
             z[:, i] = np.where(heavy, z[:, i], truncnorm.ppf(ndtr(z[:, i]), a, b))
         z *= np.where(heavy, stretch, 1.0)[:, None]
         x = np.empty_like(z)
-        x[:, self.order] = self.means[k] + np.einsum("nij,nj->ni", self.lowers[k], z)
+        for j, (mean, lower) in enumerate(zip(self.means, self.lowers, strict=True)):
+            own = k == j
+            x[np.ix_(own, self.order)] = mean + np.einsum("ij,nj->ni", lower, z[own])
         return x
 
-    def _interval(self, i: int, means: Floats, lowers: Floats, z: Floats) -> Floats:
+    def _interval(self, i: int, means: Floats, row: Floats, z: Floats) -> Floats:
         """The interval of z_i that keeps the i-th of the parameters near a bound in the support.
 
-        It depends on the z before it; both ends, shape (2, n).
+        It depends on the z before it; both ends, shape (2, n). `row` is the i-th of L.
         """
-        given = means[..., i] + np.einsum("...j,...j->...", lowers[..., i, :i], z[:, :i])
-        return np.asarray((self.bounds[i][:, None] - given) / lowers[..., i, i])
+        given = means[..., i] + np.einsum("...j,...j->...", row[..., :i], z[:, :i])
+        return np.asarray((self.bounds[i][:, None] - given) / row[..., i])
 
     def log_density(self, x: Floats) -> Floats:
         """log q at x, shape (n, d)."""
@@ -225,7 +227,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
             normal = np.log1p(-self.heavy_share) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
             for i in range(len(self.bounds)):
                 normal += truncnorm.logpdf(
-                    z[:, i], *self._interval(i, mean, lower, z)
+                    z[:, i], *self._interval(i, mean, lower[i], z)
                 ) - norm.logpdf(z[:, i])
             if self.heavy_share:
                 student = peak - 0.5 * (nu + d) * np.log1p(squared / nu)

@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_limits
 from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.lock import only_writer
+from bayesfred.io.memory import require_room
 from bayesfred.io.paths import may_write
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
@@ -33,11 +34,17 @@ from bayesfred.sampling.checkpoints import Checkpoints, in_memory
 from bayesfred.sampling.ensembles import Step, adapted, advance, begin, check_start
 from bayesfred.sampling.progress import progress_bar, searching
 from bayesfred.sampling.record import RunRecord
-from bayesfred.sampling.stopping import burn_in, checks, sufficient
+from bayesfred.sampling.stopping import (
+    FIRST_CHECK,
+    burn_in,
+    bytes_a_step,
+    checks,
+    most_steps,
+    sufficient,
+)
 
 __all__ = ["Run", "check_estimate", "check_output", "sample", "versions"]
 
-MOST_STEPS = 100_000
 PACKAGES = ("bayesfred", "emcee", "numba", "numpy", "scipy")
 
 
@@ -63,7 +70,8 @@ def sample(
     posterior : Posterior or TargetDensity
         A frame's posterior, or any density that offers what `model.protocol.TargetDensity` lists.
     estimate : MapEstimate, optional
-        Its maximum; by default found by `find_map`, once the file has been locked.
+        Its maximum; by default found by `find_map`, once the file has been locked. A resumed run
+        keeps the one in the file.
     seed : int
         The same seed, posterior and estimate give the same draws, for any number of threads.
     path : path-like, optional
@@ -75,11 +83,12 @@ def sample(
         Walkers of each ensemble, even and at least 4.
     target_ess : float
         Sampling ends when every parameter's bulk and tail effective sample sizes reach this and its
-        R-hat is at most 1.01, or after 100,000 steps.
+        R-hat is at most 1.01, or after 100,000 steps, or as many as fit in memory.
     steps : int, optional
         Run to this total number of steps instead.
     resume : bool
-        Resume the run in the file.
+        Resume the run in the file, which has to be of this posterior, seed, and numbers of
+        ensembles and walkers.
     overwrite : bool
         Replace the file.
     progress : bool
@@ -95,9 +104,10 @@ def sample(
     Raises
     ------
     InputError
-        If the file exists (and neither `resume` nor `overwrite` is given), belongs to another
-        posterior, cannot hold such a posterior or cannot be written, or another process, which is
-        named, is writing it; if the numbers of ensembles or walkers are too small; if the walkers
+        If the file exists (and neither `resume` nor `overwrite` is given), is to be resumed with
+        another posterior, seed or number of ensembles or walkers, cannot hold such a posterior or
+        cannot be written, or another process, which is named, is writing it; if the numbers of
+        ensembles or walkers are too small, or their steps would not fit in memory; if the walkers
         have no posterior density to start from or do not spread in every direction, or if they are
         stuck: what was sampled until then is saved.
     KeyboardInterrupt
@@ -120,6 +130,12 @@ def sample(
     (2, True)
     """
     _check_numbers(ensembles, walkers, target_ess, steps)
+    n_steps, d = steps or FIRST_CHECK, len(posterior.parameter_names)
+    require_room(
+        f"sampling: got {ensembles} ensembles of {walkers} walkers, whose first {n_steps} steps",
+        n_steps * bytes_a_step(ensembles * walkers, d),
+        "ask for fewer",
+    )
 
     def fresh() -> Run:
         found = estimate
@@ -146,6 +162,7 @@ def sample(
                         "to resume: start over with overwrite, or write to another file"
                     )
                 _check_same(path, fingerprint(chain.posterior()), parts)
+                _check_same_draws(path, chain, seed, ensembles, walkers)
                 run = Run.resumed(posterior, replace(chain, record=record or chain.record))
             else:
                 run = fresh()
@@ -207,6 +224,19 @@ def _check_same(path: Path, before: dict[str, str], parts: dict[str, str]) -> No
         )
 
 
+def _check_same_draws(path: Path, chain: Chain, seed: int, ensembles: int, walkers: int) -> None:
+    """Refuse to resume with numbers that would have made other draws from the first step on."""
+    made = {"seed": chain.seed, "ensembles": len(chain.chain), "walkers": chain.chain.shape[2]}
+    given = {"seed": seed, "ensembles": ensembles, "walkers": walkers}
+    changed = [name for name in made if made[name] != given[name]]
+    if changed:
+        was, now = (", ".join(f"{k} {of[k]}" for k in changed) for of in (made, given))
+        raise InputError(
+            f"{path}: the run was made with {was}, got {now}, expected the same to resume: write "
+            "to another file, or start over with overwrite"
+        )
+
+
 class Run:
     """A run in progress: what is sampled, and the steps so far.
 
@@ -221,6 +251,8 @@ class Run:
         The steps that were made already.
     record : RunRecord, optional
         Kept with the chain.
+    before : Chain, optional
+        The one that is resumed.
     """
 
     def __init__(
@@ -233,6 +265,7 @@ class Run:
         walkers: int = 32,
         steps: Sequence[Step] = (),
         record: RunRecord | None = None,
+        before: Chain | None = None,
     ) -> None:
         check_estimate(posterior, estimate)
         expected = len(posterior.parameter_names)
@@ -241,7 +274,7 @@ class Run:
                 f"record: got a truth of {record.truth.size} parameters, expected {expected}"
             )
         self.posterior, self.estimate, self.seed = posterior, estimate, seed
-        self.record = record
+        self.record, self.before = record, before
         self.near = posterior.near(estimate.params, estimate.covariance)
         self.steps = list(steps)
         self.start = steps[-1] if steps else begin(self.near, estimate, seed, ensembles, walkers)
@@ -257,7 +290,9 @@ class Run:
                 chain.chain.swapaxes(0, 1), chain.log_prob.swapaxes(0, 1), strict=True
             )
         ]
-        return cls(posterior, chain.estimate, chain.seed, steps=steps, record=chain.record)
+        return cls(
+            posterior, chain.estimate, chain.seed, steps=steps, record=chain.record, before=chain
+        )
 
     def until(
         self, target_ess: float, steps: int | None, checkpoints: Checkpoints, *, show: bool
@@ -292,7 +327,8 @@ class Run:
         if steps is None and len(self.steps) == check:
             enough, share = sufficient(self._positions(), target_ess)
             check = next(due)
-        while not enough and len(self.steps) < (MOST_STEPS if steps is None else steps):
+        most = steps or most_steps(self.start.log_prob.size, self.start.coords.shape[-1])
+        while not enough and len(self.steps) < most:
             self.steps.append(next(made))  # all of a step or nothing, whenever an interrupt comes
             if steps is not None:
                 share = len(self.steps) / steps
@@ -307,6 +343,7 @@ class Run:
     def _chain(self, target_ess: float) -> Chain:
         """The run so far, with the longest burn-in there can be: finding it takes time."""
         last, positions = self.steps[-1], self._positions()
+        made_with, earlier = self._versions()
         return Chain(
             path=None,
             density=self.posterior,
@@ -317,8 +354,19 @@ class Run:
             burn_in=max(len(self.steps) // 2, min(adapted(positions), len(self.steps) - 1)),
             seed=self.seed,
             estimate=self.estimate,
-            versions=versions(),
+            versions=made_with,
             target_ess=target_ess,
             n_invalid=last.n_invalid,
             record=self.record,
+            earlier=earlier,
         )
+
+    def _versions(self) -> tuple[dict[str, str], tuple[tuple[int, dict[str, str]], ...]]:
+        """What made the last step, and what made those before; see `Chain.earlier`."""
+        today, before = versions(), self.before
+        if before is None:
+            return today, ()
+        begun = before.chain.shape[1]
+        if today == before.versions or len(self.steps) == begun:
+            return before.versions, before.earlier
+        return today, (*before.earlier, (begun, before.versions))

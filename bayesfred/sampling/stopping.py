@@ -6,14 +6,35 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesfred._typing import Floats
+from bayesfred.io.memory import allowed_memory
 from bayesfred.sampling.convergence import bulk_sizes, effective_sizes, rhats
 from bayesfred.sampling.ensembles import adapted
 
-__all__ = ["burn_in", "checks", "forgetting", "sufficient"]
+__all__ = [
+    "burn_in",
+    "bytes_a_step",
+    "checks",
+    "forgetting",
+    "most_steps",
+    "sufficient",
+]
 
 RHAT = 1.01
+MOST_STEPS = 100_000
+COPIES = 10.0  # of all draws in memory when a run is judged, measured
 FIRST_CHECK = 8  # steps; fewer say nothing about autocorrelation
 GROWTH = 1.1  # of the number of steps between checks
+
+
+def bytes_a_step(walkers: int, n_parameters: int) -> float:
+    """Memory that a step of this many walkers, of all ensembles, takes in the end."""
+    return 8.0 * COPIES * walkers * (n_parameters + 1)
+
+
+def most_steps(walkers: int, n_parameters: int) -> int:
+    """Steps at which a run ends in any case: 100,000, or fewer where memory holds no more."""
+    affordable = allowed_memory() / bytes_a_step(walkers, n_parameters)
+    return max(FIRST_CHECK, int(min(MOST_STEPS, affordable)))
 
 
 def checks() -> Iterator[int]:

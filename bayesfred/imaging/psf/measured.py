@@ -233,7 +233,7 @@ class MeasuredPSF:
                                          prefilter=False)  # fmt: skip
         return np.asarray(values.reshape(where.shape[1:]))
 
-    def write(self, path: PathLike, *, overwrite: bool = False) -> None:
+    def write(self, path: PathLike, *, overwrite: bool = False, run: str | None = None) -> None:
         """Write the PSF with its errors as FITS.
 
         Parameters
@@ -241,6 +241,8 @@ class MeasuredPSF:
         path : path-like
         overwrite : bool
             Replace a file that exists.
+        run : str, optional
+            What the run that measured it is known by: `Chain.identity`.
 
         Raises
         ------
@@ -253,7 +255,7 @@ class MeasuredPSF:
             "oversampling": self.oversampling, "field_radius": self.field_radius,
             "determined": self.determined, "model_error": self.model_error,
         }  # fmt: skip
-        psf_images.write_psf(path, image, arrays, numbers, overwrite=overwrite)
+        psf_images.write_psf(path, image, arrays, numbers, overwrite=overwrite, run=run)
 
     @classmethod
     def read(cls, path: PathLike) -> Self:
