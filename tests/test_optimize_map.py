@@ -39,6 +39,7 @@ from bayesfred.model.parameters import Nuisances, parameter_table
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.sampler import sample
 
 Floats = NDArray[np.float64]

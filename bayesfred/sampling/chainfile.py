@@ -127,7 +127,7 @@ def write_chain(chain: Chain) -> None:
 
 
 def _write_versions(group: Any, versions: dict[str, str]) -> None:
-    group.attrs.update({name: np.bytes_(version) for name, version in versions.items()})
+    group.attrs.update({name: np.bytes_(version) for name, version in sorted(versions.items())})
 
 
 def _read_versions(group: Any) -> dict[str, str]:
