@@ -346,7 +346,7 @@ def correct(
 def verify(
     chain_file: ChainFile,
     every_draw: Annotated[
-        bool, typer.Option("--all", help="Every draw's log-probability, not 1,000 of them.")
+        bool, typer.Option("--all", help="Every draw and step, not 1,000 draws and 10 steps.")
     ] = False,
 ) -> None:
     """Compute again what a chain file holds: hashes, log-probabilities, maximum, first steps."""

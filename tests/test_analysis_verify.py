@@ -17,6 +17,7 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.chainfile import fingerprint
 
 STEPS = 15
 CHECKS = (
@@ -28,6 +29,9 @@ CHECKS = (
     "covariance",
     "first steps",
     "numbers",
+    "random state",
+    "burn-in",
+    "not checked",
 )
 
 
@@ -104,7 +108,12 @@ CHANGES: dict[str, tuple[Change, set[str]]] = {
         {"log-probability"},
     ),
     "the moves": (lambda f: add(f, "ensemble_0/accepted", 3, 1), {"numbers"}),
-    "the seed": (lambda f: f.attrs.update(seed=2), {"first steps", "numbers"}),
+    "the burn-in": (lambda f: f.attrs.update(burn_in=3), {"burn-in"}),
+    "the random state": (
+        lambda f: f["ensemble_1"].attrs.update(random_state_2=17),
+        {"random state"},
+    ),
+    "the seed": (lambda f: f.attrs.update(seed=2), {"first steps", "numbers", "random state"}),
     "the MAP's value": (
         lambda f: f["estimate"].attrs.update(log_prob=-1.0),
         {"MAP's log-probability"},
@@ -141,11 +150,8 @@ def test_what_was_changed_is_found(path: Path, name: str) -> None:
         verify(path)
     reseal(path)
     found = failed(verify(path, every_draw=True))
-    assert found - {"first steps", "numbers", "covariance"} == wrong - {
-        "first steps",
-        "numbers",
-        "covariance",
-    }
+    follow = {"first steps", "numbers", "random state", "covariance"}
+    assert found - follow == wrong - follow
     assert found >= wrong
 
 
@@ -180,3 +186,18 @@ def test_a_maximum_that_was_not_found_is_not_asked_for(
     given = replace(given, at_maximum=True)
     checks = verify(run(posterior, given, tmp_path / "other.h5", 3).path)
     assert failed(checks) >= {"MAP"}
+
+
+def test_a_file_replaced_meanwhile_is_not_mixed_with_the_one_that_is_checked(
+    path: Path, whole: Chain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    digest = whole.path.read_bytes()[-65:-1].decode()
+    told = finding(verify(path), "file")
+
+    def replaced(posterior: Posterior) -> dict[str, str]:
+        path.write_bytes(b"another file")
+        return fingerprint(posterior)
+
+    monkeypatch.setattr("bayesfred.analysis.verify.fingerprint", replaced)
+    checks = verify(path)
+    assert failed(checks) == set() and finding(checks, "file") == told == f"SHA-256 {digest}"

@@ -13,19 +13,18 @@ from scipy.linalg import solve_triangular
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
-from bayesfred.io.hdf5_checks import stated_digest
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import (
     changed_parts,
     fingerprint,
-    open_chain,
-    stored_fingerprint,
+    open_whole,
 )
 from bayesfred.sampling.laplace import laplace
 from bayesfred.sampling.moves import LaplaceMove
 from bayesfred.sampling.sampler import sample
+from bayesfred.sampling.stopping import burn_in, most_burn_in
 
 DRAWS = 1000  # whose log-probability is computed again, unless those of all draws are
 STEPS = 10  # replayed from the seed
@@ -68,7 +67,8 @@ def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
     ----------
     path : Path
     every_draw : bool
-        Compute the log-probability of every draw, not of 1,000 evenly spaced ones.
+        Compute the log-probability of every draw, not of 1,000 evenly spaced ones, and replay every
+        step, not the first 10.
 
     Returns
     -------
@@ -77,25 +77,27 @@ def verify(path: Path, *, every_draw: bool = False) -> list[Check]:
     Raises
     ------
     InputError
-        If the file is refused before anything can be computed, see `open_chain`.
+        If the file is refused before anything can be computed; see `sampling.chainfile.open_chain`.
     """
-    chain = open_chain(path)
+    chain, stored, digest = open_whole(path)
     posterior = chain.posterior()
     if chain.method == "laplace":
         computed = [*_maximum(chain, posterior), _laplace_draws(chain)]
     else:
         near = posterior.near(chain.estimate.params, chain.estimate.covariance)  # as in the run
-        computed = [_log_prob(chain, near, every_draw), *_maximum(chain, posterior), *_steps(chain)]
+        computed = [_log_prob(chain, near, every_draw), *_maximum(chain, posterior)]
+        computed += [*_steps(chain, every_draw), _burn_in(chain)]
     return [
-        Check("file", f"SHA-256 {stated_digest(path)}", True),  # it has been opened
-        _posterior(path, posterior),
+        Check("file", f"SHA-256 {digest}", True),  # it has been opened
+        _posterior(stored, posterior),
         *computed,
+        Check("not checked", "what nothing follows from: target ESS, versions, record", True),
     ]
 
 
-def _posterior(path: Path, posterior: Posterior) -> Check:
+def _posterior(stored: dict[str, str], posterior: Posterior) -> Check:
     rebuilt = fingerprint(posterior)
-    changed = changed_parts(stored_fingerprint(path), rebuilt)
+    changed = changed_parts(stored, rebuilt)
     if changed:
         return Check("posterior", f"differs when rebuilt: {', '.join(changed)}", False)
     parts = ", ".join(f"{name} {digest[:8]}" for name, digest in rebuilt.items())
@@ -148,8 +150,14 @@ def _maximum(chain: Chain, posterior: Posterior) -> list[Check]:
     ]
 
 
-def _steps(chain: Chain) -> list[Check]:
-    """The first steps replayed, and the numbers of accepted moves.
+def _burn_in(chain: Chain) -> Check:
+    expected = {burn_in(chain.chain), most_burn_in(chain.chain)}  # of a run that ended, or not
+    says = " or ".join(str(steps) for steps in sorted(expected))
+    return Check("burn-in", f"{chain.burn_in} steps, {says} follow", chain.burn_in in expected)
+
+
+def _steps(chain: Chain, every_step: bool) -> list[Check]:
+    """The first steps or all replayed, the numbers of accepted moves, and the random state.
 
     A chain does not show which moves of the first step were accepted; the replay does.
     """
@@ -161,7 +169,7 @@ def _steps(chain: Chain) -> list[Check]:
             seed=chain.seed,
             ensembles=ensembles,
             walkers=walkers,
-            steps=min(STEPS, n_steps),
+            steps=n_steps if every_step else min(STEPS, n_steps),
             progress=False,
         )
     except InputError as error:
@@ -188,7 +196,19 @@ def _steps(chain: Chain) -> list[Check]:
             f"{counted}, {moved.sum()} counted again",
             np.array_equal(moved, chain.accepted),
         ),
+        _random_state(chain, replay),
     ]
+
+
+def _random_state(chain: Chain, replay: Chain) -> Check:
+    """The state from which a resumed run goes on, where the replay came as far."""
+    if replay.chain.shape[1] < chain.chain.shape[1]:
+        return Check("random state", "not compared: only a replay of every step reaches it", True)
+    same = all(
+        np.array_equal(again[1], stored[1]) and again[2:] == stored[2:]
+        for again, stored in zip(replay.random_states, chain.random_states, strict=True)
+    )
+    return Check("random state", "reached again" if same else "another one is reached", same)
 
 
 def _laplace_draws(chain: Chain) -> Check:

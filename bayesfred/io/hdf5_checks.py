@@ -44,15 +44,15 @@ def seal(content: memoryview | bytes) -> bytes:
     return SEAL.format(hashlib.sha256(content).hexdigest()).encode()
 
 
-def stated_digest(path: Path) -> str:
-    """The SHA-256 in a file's seal."""
-    with open(path, "rb") as stream:
-        stream.seek(-SEAL_SIZE, os.SEEK_END)
-        return stream.read().decode().split()[-1]
+@contextmanager
+def open_checked(path: Path, kind: bytes = KIND) -> Iterator[h5py.File]:
+    """A file to read from, as of `open_with_digest`."""
+    with open_with_digest(path, kind) as (file, _):
+        yield file
 
 
 @contextmanager
-def open_checked(path: Path, kind: bytes = KIND) -> Iterator[h5py.File]:
+def open_with_digest(path: Path, kind: bytes = KIND) -> Iterator[tuple[h5py.File, str]]:
     """A file to read from, once it has passed; whatever is wrong with it becomes one line.
 
     Parameters
@@ -63,7 +63,9 @@ def open_checked(path: Path, kind: bytes = KIND) -> Iterator[h5py.File]:
 
     Yields
     ------
-    h5py.File
+    file : h5py.File
+    digest : str
+        The SHA-256 of its content, which is the one in its seal.
 
     Raises
     ------
@@ -79,13 +81,13 @@ def open_checked(path: Path, kind: bytes = KIND) -> Iterator[h5py.File]:
         )
     try:
         with open(path, "rb") as stream:
-            size = _check_seal(stream, kind)
+            size, content = _check_seal(stream, kind)
             # the very file whose seal was checked, even if another is renamed over it meanwhile
             with h5py.File(stream, "r") as file:
                 _check_attributes("", file.id)
                 _check_schema(kind, file.attrs.get("kind"), file.attrs.get("schema"))
                 _check_tree(file.id, size)
-                yield file
+                yield file, content
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (
@@ -107,8 +109,8 @@ def _name(kind: bytes) -> str:
     return kind.decode().removeprefix("bayesfred ")
 
 
-def _check_seal(stream: BinaryIO, kind: bytes) -> int:
-    """Size of the file, whose content is what its seal says; the stream is back at its start."""
+def _check_seal(stream: BinaryIO, kind: bytes) -> tuple[int, str]:
+    """Size and SHA-256 of a file that is what its seal says; the stream is back at its start."""
     size = os.fstat(stream.fileno()).st_size
     digest, left = hashlib.sha256(), size - SEAL_SIZE
     while left > 0:
@@ -127,7 +129,7 @@ def _check_seal(stream: BinaryIO, kind: bytes) -> int:
             f"changed: {REMEDY}"
         )
     stream.seek(0)
-    return size
+    return size, digest.hexdigest()
 
 
 def _check_schema(expected: bytes, kind: Any, schema: Any) -> None:

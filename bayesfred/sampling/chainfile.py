@@ -12,7 +12,7 @@ import hashlib
 import io
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import h5py
 import numpy as np
@@ -20,7 +20,7 @@ import numpy as np
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
 from bayesfred.io import atomic
-from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, seal
+from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, open_with_digest, seal
 from bayesfred.io.sealed import FORMAT
 from bayesfred.io.serialize import read, write, write_array
 from bayesfred.model.dithered import DitheredPosterior
@@ -73,10 +73,27 @@ def fingerprint(posterior: TargetDensity) -> dict[str, str]:
         return _digests(file)
 
 
-def stored_fingerprint(path: Path) -> dict[str, str]:
-    """The hashes of the parts of the posterior in a chain file, without rebuilding it."""
-    with open_checked(path) as file:
-        return _digests(file["posterior"])
+class Opened(NamedTuple):
+    """A chain file, all of it read from one stream.
+
+    Attributes
+    ----------
+    chain : Chain
+    fingerprint : dict of str to str
+        The hashes of the parts of its posterior, as they are stored.
+    digest : str
+        The SHA-256 of the file.
+    """
+
+    chain: Chain
+    fingerprint: dict[str, str]
+    digest: str
+
+
+def open_whole(path: PathLike) -> Opened:
+    """Read a chain file with what it is known by; see `open_chain`."""
+    with open_with_digest(Path(path)) as (file, digest):
+        return Opened(_read(Path(path), file), _digests(file["posterior"]), digest)
 
 
 def changed_parts(before: dict[str, str], after: dict[str, str]) -> list[str]:

@@ -31,7 +31,7 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import changed_parts, fingerprint, open_chain, write_chain
 from bayesfred.sampling.checkpoints import Checkpoints, in_memory
-from bayesfred.sampling.ensembles import Step, adapted, advance, begin, check_start
+from bayesfred.sampling.ensembles import Step, advance, begin, check_start
 from bayesfred.sampling.progress import progress_bar, searching
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.stopping import (
@@ -39,6 +39,7 @@ from bayesfred.sampling.stopping import (
     burn_in,
     bytes_a_step,
     checks,
+    most_burn_in,
     most_steps,
     sufficient,
 )
@@ -351,7 +352,7 @@ class Run:
             log_prob=np.stack([step.log_prob for step in self.steps], axis=1),
             accepted=last.accepted,
             random_states=tuple(last.random),
-            burn_in=max(len(self.steps) // 2, min(adapted(positions), len(self.steps) - 1)),
+            burn_in=most_burn_in(positions),
             seed=self.seed,
             estimate=self.estimate,
             versions=made_with,

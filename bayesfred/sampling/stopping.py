@@ -15,6 +15,7 @@ __all__ = [
     "bytes_a_step",
     "checks",
     "forgetting",
+    "most_burn_in",
     "most_steps",
     "sufficient",
 ]
@@ -79,6 +80,12 @@ def burn_in(chain: Floats) -> int:
     n_steps: int = chain.shape[1] - made
     kept = chain[:, made + n_steps // 4 :]
     return made + forgetting(n_steps, float(np.min(bulk_sizes(kept))), kept[..., 0].size)
+
+
+def most_burn_in(chain: Floats) -> int:
+    """Number of steps to leave out of a run that has not ended; see `burn_in`."""
+    n_steps: int = chain.shape[1]
+    return max(n_steps // 2, min(adapted(chain), n_steps - 1))
 
 
 def forgetting(n_steps: int, effective: float, draws: int) -> int:
