@@ -356,6 +356,7 @@ def judged(off: Floats, stated: Floats) -> None:
         assert abs(left[0, 1]) < 4.0 / np.sqrt(n)
 
 
+@pytest.mark.statistics
 def test_coverage_on_the_sky() -> None:
     """200 refits at four places, one of them in the frame's corner, beyond the stars."""
     off, stated = refits(200)

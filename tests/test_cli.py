@@ -1464,6 +1464,7 @@ def test_real_frame_is_sampled(tmp_path: Path) -> None:
 
 
 @REAL
+@pytest.mark.long
 def test_real_frame(tmp_path: Path) -> None:
     """A star tracker's frame with the example's run file: the model fits, and is to be sampled.
 

@@ -554,6 +554,7 @@ def test_frames_maxima_are_where_the_search_begins(folder: Path) -> None:
     assert np.abs((again.params - estimate.params) / sd).max() < 2e-3
 
 
+@pytest.mark.long
 def test_psfs_are_measured_on_each_frame_or_shared_from_a_file(folder: Path) -> None:
     def read(psf: str) -> bf.JointPosterior:
         text = RUN.replace("sigma = 2.0", psf)

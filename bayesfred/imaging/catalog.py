@@ -67,6 +67,11 @@ class SourceCatalog:
                 "9e15: remove it or correct it"
             )
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for column in (self.x, self.y, self.flux):
+            column.setflags(write=False)  # which pickling forgets, and compiled code is typed by
+
     @classmethod
     def grid(cls, side: int, spacing: float, flux: float) -> Self:
         """Lay out a square array of equal sources centred on the axis, row by row.

@@ -6,10 +6,10 @@ thread evaluates in a workspace of its own, which is kept for the next call.
 """
 
 import queue
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ from bayesfred.model.kernels.contexts import (
     Workspace,
     parameters_of,
 )
-from bayesfred.model.kernels.evaluate import log_likelihoods, render
+from bayesfred.model.kernels.evaluate import extrapolated_log_likelihoods, log_likelihoods, render
 from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
@@ -88,16 +88,28 @@ class FrameLikelihood:
         It is -inf where it is not `wanted`, shape (n,), or where the distortion has no density.
         """
         out = np.where(wanted, 0.0, -np.inf)
-        arguments = self._arguments(vectors)
-        extrapolated = self.extrapolation and self.extrapolation.at(vectors)
+        arguments, rows = self._arguments(vectors), np.arange(len(vectors))
+        if self.extrapolation:
+            fast = partial(
+                extrapolated_log_likelihoods, extrapolated=self.extrapolation.at(vectors)
+            )
+            self._evaluate(fast, arguments, out)
+            rows = np.flatnonzero(np.isnan(out))
+        if rows.size:
+            left = np.where(np.isnan(out[rows]), 0.0, out[rows])
+            self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left)
+            out[rows] = left
+        return out + self._constant
+
+    def _evaluate(self, kernel: Callable[..., None], vectors: Vectors, out: Floats) -> None:
+        """Let a kernel fill `out` in threads."""
         turns = Turns(np.zeros(1, np.int64), out)
 
         def evaluate() -> None:
             with self._workspace() as w:
-                log_likelihoods(self._problem, w, arguments, extrapolated, turns)
+                kernel(self._problem, w, vectors, turns=turns)
 
-        share(evaluate, len(vectors))
-        return out + self._constant
+        share(evaluate, len(out))
 
     def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
         """The same likelihood, evaluated several times faster around `params` if fluxes are free.

@@ -9,15 +9,18 @@ arguments: the compiled halves of other PSFs and noise models.
 import hashlib
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numba as nb
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.types import BaseNamedTuple, BaseTuple  # type: ignore[attr-defined]
 
+PATIENCE = 60.0  # seconds for which another process may compile a function
 # Folders of the package with compiled code.
 FOLDERS = ("imaging/kernels", "imaging/psf", "model/kernels", "model/noise")
 
@@ -67,7 +70,12 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     Code for families from outside the package has an index of its own: without their modules it
     cannot be read. Where such a module has no file there is nothing to key on, so nothing is kept.
+    Of processes that need the same code at the same time one compiles, and the others wait.
     """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._compiling: dict[Any, filelock.BaseFileLock] = {}
 
     def _select(self, sig: Any) -> bool:
         """Choose the index for these argument types; False where nothing is kept."""
@@ -83,11 +91,36 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return None not in hashes
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        return super()._load_overload(sig, target_context) if self._select(sig) else None
+        """Find machine code, or be the one process that compiles it, if others do not take long."""
+        if not self._select(sig):
+            return None
+        found = super()._load_overload(sig, target_context)
+        if found is None and sig not in self._compiling:
+            lock = filelock.FileLock(self._lock_path(sig), PATIENCE)
+            with suppress(OSError):  # a timeout is one; where nothing can be written nobody waits
+                lock.acquire(poll_interval=0.02)
+            self._compiling[sig] = lock
+            found = super()._load_overload(sig, target_context)
+            if found is not None:
+                self._release(sig)
+        return found
 
     def _save_overload(self, sig: Any, data: Any) -> None:
         if self._select(sig):
-            super()._save_overload(sig, data)
+            try:
+                super()._save_overload(sig, data)
+            finally:
+                self._release(sig)
+
+    def _lock_path(self, sig: Any) -> Path:
+        name = f"{self._impl.filename_base} {sig}".encode()
+        return Path(self._cache_path) / f"{hashlib.sha256(name).hexdigest()[:32]}.lock"
+
+    def _release(self, sig: Any) -> None:
+        if lock := self._compiling.pop(sig, None):
+            lock.release()
+            with suppress(OSError):
+                Path(lock.lock_file).unlink(missing_ok=True)
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -58,23 +58,12 @@ def render(problem, w, parameters):
     return Rendered(extra + more, geometry, layout.footprints, fluxes, profiled)
 
 
-@inner()
-def _extrapolate(problem, w, vectors, i, extrapolated):
-    """The log-likelihood by `extrapolate.py`; NaN where that does not serve."""
-    if extrapolated is None:
-        return math.nan
-    fluxes = extrapolated.fluxes[i].copy()
-    value = profile_extrapolated(problem, w, parameters_of(vectors, i), fluxes, extrapolated)
-    clear(w)
-    return value
-
-
 @entry()
-def log_likelihoods(problem, w, vectors, extrapolated, turns):
+def log_likelihoods(problem, w, vectors, turns):
     """Log-likelihoods of rows into turns.values; rows where it is -inf already are left alone.
 
-    `extrapolated` is None, or fluxes near their maximum. Each row is whose turn it is: threads that
-    share `turns` share the rows, and one that is held up takes fewer.
+    Each row is whose turn it is: threads that share `turns` share the rows, and one that is held up
+    takes fewer.
     """
     out = turns.values
     while True:
@@ -82,11 +71,27 @@ def log_likelihoods(problem, w, vectors, extrapolated, turns):
         if i >= out.size:
             break
         if out[i] > -math.inf:
-            value = _extrapolate(problem, w, vectors, i, extrapolated)
-            if math.isnan(value):
-                parameters = parameters_of(vectors, i)
-                value = render(problem, w, parameters).extra
-                if value > -math.inf:
-                    value += log_likelihood(problem.frame, w, parameters)
-                clear(w)
+            parameters = parameters_of(vectors, i)
+            value = render(problem, w, parameters).extra
+            if value > -math.inf:
+                value += log_likelihood(problem.frame, w, parameters)
+            clear(w)
             out[i] = value
+
+
+@entry()
+def extrapolated_log_likelihoods(problem, w, vectors, turns, extrapolated):
+    """The same by `extrapolate.py`; NaN where that does not serve.
+
+    A function of its own, so that neither is compiled for the other's sake.
+    """
+    out = turns.values
+    while True:
+        i = take_turn(turns.turn)
+        if i >= out.size:
+            break
+        if out[i] > -math.inf:
+            fluxes = extrapolated.fluxes[i].copy()
+            parameters = parameters_of(vectors, i)
+            out[i] = profile_extrapolated(problem, w, parameters, fluxes, extrapolated)
+            clear(w)

@@ -63,7 +63,9 @@ class MomentTable:
         step = self.grid[:, 1] - self.grid[:, 0]
         # in units of a cell
         return InformationRows(
-            self.grid[:, 0].copy(), step, cubics * step[:, None, None] ** np.arange(3, -1, -1)
+            self.grid[:, 0].copy(),
+            step,
+            np.ascontiguousarray(cubics * step[:, None, None] ** np.arange(3, -1, -1)),
         )
 
     def row(self, read_noise: float | Floats) -> float | Floats:
