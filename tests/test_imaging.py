@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable
 
@@ -890,3 +891,14 @@ def test_bad_sampling_sizes_are_refused() -> None:
     for n in (0, -3, 2.5):
         with pytest.raises(InputError, match="n: got"):
             sampling_matrix(n)  # type: ignore[arg-type]
+
+
+def test_a_pickled_catalogue_needs_no_other_compiled_code() -> None:
+    """Arrays that may be written to have another type there than those that may not."""
+    sources = SourceCatalog([0.0, 30.0], [0.0, -20.0], [1e4, 2e4])
+    again = pickle.loads(pickle.dumps(sources))
+    for name in ("x", "y", "flux"):
+        column = getattr(again, name)
+        assert np.array_equal(column, getattr(sources, name)) and not column.flags.writeable
+    # negative control: what pickling does to an array
+    assert pickle.loads(pickle.dumps(sources.x)).flags.writeable

@@ -5,6 +5,8 @@ import os
 import shutil
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,8 @@ def value(parts):
 
 BEGIN = """
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from bayesfred.imaging.kernels import compilation
 if "numba alone" in sys.argv:
     compilation._Cache = compilation.FunctionCache
@@ -107,3 +111,36 @@ def test_an_edited_psf_from_outside_is_compiled_again(
             printed(package, INSIDE, *arguments)
     else:
         assert printed(package, INSIDE) == 4.0
+
+
+TOGETHER = (
+    BEGIN
+    + """
+import time
+from pathlib import Path
+import numpy as np
+from numba.core import event
+Path("ready" + sys.argv[1]).touch()
+while not Path("go").exists():
+    time.sleep(0.001)
+with event.install_recorder("numba:compile") as compiled:
+    assert linear(np.array([[3.0, 2.0], [1.0, 0.0]]), 4.0, 5.0) == 17.0
+names = [each.data["dispatcher"].py_func.__name__ for _, each in compiled.buffer if each.is_end]
+print(names.count("linear"))
+"""
+)
+
+
+@pytest.mark.parametrize("arguments", [(), ("numba alone",)])
+def test_of_processes_that_need_a_function_one_compiles_it(
+    package: Path, arguments: tuple[str, ...]
+) -> None:
+    """Negative control: with numba's own cache each compiles it."""
+    with ThreadPoolExecutor(2) as pool:
+        counts = [pool.submit(printed, package, TOGETHER, name, *arguments) for name in "ab"]
+        while not all((package.parent / f"ready{name}").exists() for name in "ab"):
+            assert not any(count.done() for count in counts)
+            time.sleep(0.01)
+        (package.parent / "go").touch()
+        assert sum(count.result() for count in counts) == (2.0 if arguments else 1.0)
+    assert not list(package.rglob("*.lock"))

@@ -13,6 +13,7 @@ from scipy import integrate, spatial, stats
 
 import bayesfred as bf
 from bayesfred._typing import Floats
+from bayesfred.analysis.verify import verify
 from bayesfred.calibration.degeneracies import lost_directions
 from bayesfred.calibration.dither_tables import newton_misses
 from bayesfred.calibration.self_calibration import SelfCalibration, self_calibrate
@@ -22,6 +23,7 @@ from bayesfred.model.dither_layout import rotation
 from bayesfred.model.dithered import DitheredPosterior
 from bayesfred.model.movable import MovableLikelihood
 from bayesfred.optimize.dithers import link_peaks, shifts_between
+from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.laplace import importance_efficiency
 
 FREE = bf.Nuisances(flux="free")
@@ -517,12 +519,18 @@ def test_calibration_maps_the_field_within_its_errors(field, found, tmp_path) ->
     assert 0.0 < sd.max() < 0.05
 
 
-def test_laplace_and_find_map_run_on_the_posterior(found) -> None:
+def test_laplace_and_find_map_run_on_the_posterior(found, tmp_path) -> None:
     again = bf.find_map(found.posterior, found.estimate.params)
     assert again.at_maximum and np.allclose(again.params, found.estimate.params)
-    chain = bf.laplace(found.posterior, found.estimate, seed=1, draws=64, progress=False)
+    path = tmp_path / "dithers.h5"
+    chain = bf.laplace(found.posterior, found.estimate, seed=1, draws=64, path=path, progress=False)
     assert chain.draws().shape == (64, found.posterior.n_parameters)
     assert importance_efficiency(chain) > 0.5
+    stored = open_chain(path)
+    assert np.array_equal(stored.chain, chain.chain)
+    rebuilt, draws = stored.posterior(), chain.draws()[:4]
+    assert rebuilt.log_prob(draws).tobytes() == found.posterior.log_prob(draws).tobytes()
+    assert all(check.holds for check in verify(path))
 
 
 def test_sampler_agrees_with_the_laplace_approximation() -> None:
