@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import bayesfred as bf
-from bayesfred.errors import InputError
+from bayesfred.errors import ENDINGS, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -363,20 +363,22 @@ def _run(work: "Callable[[], bool]") -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters of a path
             stream.reconfigure(errors="backslashreplace")
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # to end as after a Ctrl-C
+    before = {  # to end as after a Ctrl-C; what is ignored, as by nohup, stays so
+        number: signal.signal(number, signal.default_int_handler)
+        for number in ENDINGS
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
     try:
         well = work()
     except InputError as error:
         typer.echo(f"bayesfred: {error}", err=True)
         raise typer.Exit(2) from None
-    except KeyboardInterrupt:
-        typer.echo(
-            "bayesfred: interrupted; what a run has sampled or a study has finished is saved: "
-            "resume it with --resume",
-            err=True,
-        )
+    except KeyboardInterrupt as stop:
+        kept = "; ".join(getattr(stop, "__notes__", []))
+        typer.echo(f"bayesfred: interrupted; {kept or 'nothing had to be saved'}", err=True)
         raise typer.Exit(130) from None
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if not well:
         raise typer.Exit(3)

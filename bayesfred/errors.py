@@ -1,7 +1,12 @@
 """The exception for input that a user can correct, and the warning of a result that says little.
 
-The command line prints the exception and exits with 2.
+The command line prints the exception and exits with 2. And what ends it as a Ctrl-C does.
 """
+
+import signal
+
+# Windows has no hang-up
+ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 def printable(text: str) -> str:

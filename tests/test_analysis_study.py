@@ -807,6 +807,7 @@ def test_an_interrupt_keeps_everything(
     _, said = process.communicate(timeout=300)
     assert process.returncode == 130, said
     assert "Traceback" not in said
+    assert said.splitlines()[-1].endswith("holds what is finished: resume it with --resume")
     n = len(lines(table))
     assert 0 < n < 50000
     assert study(f"replicates = {n + 2}\n", resume=True)

@@ -96,7 +96,6 @@ def test_plain_terminals_get_plain_text(folder: Path) -> None:
     (folder / "run.toml").write_text(run_text(sampling="steps = 12"), encoding="utf-8")
     for extra, plain in (
         ({}, False),
-        ({"NO_COLOR": "1"}, True),
         ({"TERM": "dumb"}, True),
     ):
         code, shown, errors = in_terminal(folder, 80, "fit", "run.toml", "--overwrite", **extra)

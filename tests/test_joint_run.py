@@ -206,6 +206,7 @@ def test_one_table_has_the_sources_of_all(mapped: tuple[Path, Output]) -> None:
             assert np.array_equal(table[key][of_frame], expected[key], equal_nan=True)
 
 
+@pytest.mark.long
 def test_a_frame_of_another_lens_is_named_in_json(tmp_path: Path) -> None:
     write(tmp_path, odd={"f_x2": 9e-4, "g_y2": -4e-4})
     output = invoke(tmp_path, "fit", "run.toml", "--map-only", "--json")
@@ -506,6 +507,7 @@ def test_what_is_of_one_frame_says_so(folder: Path, command: str) -> None:
 # --- more than a fit ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_drift(tmp_path: Path) -> None:
     """The lens of c is another; on a straight line in time it need not be."""
     times = dict(zip("abc", (0.0, 1.0, 3.0), strict=True))

@@ -251,6 +251,7 @@ def test_a_model_error_costs_little_where_there_is_none() -> None:
     assert np.mean(np.abs(found[True][0]) < 1.0) > 0.6
 
 
+@pytest.mark.long
 def test_most_likely_fluxes_are_found_with_any_model_error():
     """Of stars that touch, with another PSF than theirs, some on the edge of a ghost.
 

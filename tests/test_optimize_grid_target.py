@@ -393,6 +393,7 @@ def test_own_counts_are_the_wrong_variance() -> None:
     assert mean - 1.0 > 4.0 * error + 0.006, (mean, error)
 
 
+@pytest.mark.long
 def test_dots_are_fitted_with_that_variance() -> None:
     """A Gaussian fit of sources to the inverted frame has a chi-square of 1 per pixel.
 

@@ -889,11 +889,11 @@ def test_incomplete_files_are_refused(whole: Chain, tmp_path: Path, part: str) -
 # --- the posterior in the file --------------------------------------------------------------------
 
 POSTERIORS: list[tuple[Nuisances, Any, Detector, bool]] = [
-    (Nuisances(), PoissonNoise(), Detector((60, 75)), True),
+    (Nuisances(), PoissonNoise(1.25), Detector((60, 75)), True),
     (Nuisances("scale", footprint=12.5), BackgroundNoise(), Detector((60, 75)), False),
     (
         Nuisances("free", psf_sigma=True, background_order=1),
-        PoissonNoise(1.25),
+        PoissonNoise(),
         Detector((30, 37), 2, "box"),
         True,
     ),

@@ -39,7 +39,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.extra_parameters import REAL, judge_extra
@@ -48,6 +47,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.newton import NewtonResult, maximize
@@ -156,7 +156,7 @@ def choose_terms(posterior: Posterior) -> TermChoice:
     >>> chosen.distortion == truth, chosen.tried["degree"].tolist()
     (True, [1, 2, 3, 4])
     """
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         fits = _fits(posterior)
         # all degrees are scored on the same folds, so images have to be where they are found
         scouts = [*itertools.islice(fits, SCOUT)]

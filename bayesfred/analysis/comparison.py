@@ -34,7 +34,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.comparable import comparable_posteriors, require_sampled
@@ -54,6 +53,7 @@ from bayesfred.analysis.joint_folds import (
     require_visible,
 )
 from bayesfred.errors import InputError
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.chain import Chain
@@ -235,7 +235,7 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
     posteriors = comparable_posteriors(chains)
     for name, chain in chains.items():
         require_sampled(name, chain)
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         evidence = {name: log_evidence(chain) for name, chain in chains.items()}
         likely = max(chains, key=lambda name: evidence[name].log_evidence)
         folds = fold_frames(posteriors[likely], chains[likely].estimate.params, FOLDS)

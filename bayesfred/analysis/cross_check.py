@@ -51,7 +51,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.agreement import Agreement, Verdict
@@ -66,6 +65,7 @@ from bayesfred.analysis.held_scatter import hold_scatter
 from bayesfred.analysis.joint_folds import AnyPosterior, fold_frames, require_visible
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 
@@ -254,7 +254,7 @@ def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None)
     >>> found.verdict, found.displacement.dof
     ('right', 4)
     """
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         whole = estimate or find_map(posterior)
         folds = fold_frames(posterior, whole.params, 2)
         require_visible(folds, 2, "to make halves of")

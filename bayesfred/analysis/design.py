@@ -18,7 +18,6 @@ from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.field import (
@@ -41,6 +40,7 @@ from bayesfred.analysis.planned import (
 )
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import inverse
 
 __all__ = ["Choice", "Design", "design"]
@@ -233,7 +233,7 @@ def design(
     if not (math.isfinite(error) and error > 0.0):
         raise InputError(f"error: got {error!r}, expected a finite number of pixels > 0")
     candidates = _pointings(dithers)
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         prior = posterior.prior_information(params)
         plan = planned(posterior, params)
         told = plan.fisher(params) + prior

@@ -36,11 +36,11 @@ import numpy as np
 from arviz_stats.base import array_stats
 from scipy import optimize
 from scipy.special import expit, log_expit, logsumexp
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import effective_size
@@ -109,7 +109,7 @@ def log_evidence(chain: Chain) -> Evidence:
     ('-10360.3', True)
     """
     random, density = random_numbers(chain), chain.density
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         if chain.method == "laplace":
             return importance_evidence(density, chain.estimate, PROPOSALS, random)[0]
         move = LaplaceMove.of(density, chain.estimate)

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import PathLike
 from bayesfred.analysis.processes import new_pool, uninterrupted
@@ -33,7 +32,7 @@ from bayesfred.io import tables
 from bayesfred.io.lock import only_writer
 from bayesfred.io.memory import require_room
 from bayesfred.io.paths import may_write
-from bayesfred.model.threads import one_thread
+from bayesfred.model.threads import one_blas_thread, one_thread
 from bayesfred.sampling.progress import progress_bar
 from bayesfred.sampling.sampler import versions
 
@@ -104,7 +103,7 @@ def answer(key: str, study: Study | None, k: int) -> Answer:
     if known is None:
         return Answer(worker, None, None)
     try:
-        with one_thread(), threadpool_limits(1, user_api="blas"):
+        with one_thread(), one_blas_thread():
             return Answer(worker, tuple(map(float, known.task(k))), "")
     except Exception as error:  # whatever stops one task must not stop the others
         return Answer(
@@ -191,7 +190,11 @@ def run(
             updated = resumed(record, everything)
             if updated != record.meta:
                 tables.with_meta(path, text, tables.TableRecord(record.columns, updated))
-            lost = _work(study, key, todo, n, path, (executor, workers, progress))
+            try:
+                lost = _work(study, key, todo, n, path, (executor, workers, progress))
+            except KeyboardInterrupt as stop:
+                stop.add_note(f"{path} holds what is finished: resume it with --resume")
+                raise
             if lost:
                 raise InputError(
                     f"{path}: {len(lost)} of {n} tasks failed by no fault of theirs ({lost[0]}), "

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import arviz_base
 import lazy_loader
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.sampling.chain import Chain
 
 __all__ = ["Sensitivities", "sensitivities"]
@@ -106,7 +106,7 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
     with (
         warnings.catch_warnings(),
         np.errstate(invalid="ignore"),
-        threadpool_limits(1, user_api="blas"),
+        one_blas_thread(),
     ):
         warnings.filterwarnings("ignore", message="Number of tail draws")
         try:

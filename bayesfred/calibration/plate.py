@@ -25,11 +25,11 @@ import numpy as np
 from numpy.polynomial.chebyshev import cheb2poly, chebvander
 from numpy.polynomial.polynomial import polyval2d
 from scipy.special import comb
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.io.tangent_plane import TangentPlane
+from bayesfred.model.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from bayesfred.calibration.calibration import Calibration
@@ -317,7 +317,7 @@ def _fits(points: Floats, values: Floats, degree: int) -> Floats:
     """Polynomials in points that differ from fit to fit, all of shape (k, 2, points)."""
     low, high = points[0].min(axis=1), points[0].max(axis=1)
     middle, half = 0.5 * (low + high)[:, None], 0.5 * (high - low)[:, None]
-    with threadpool_limits(1, user_api="blas"):  # matrices too small to be shared
+    with one_blas_thread():  # matrices too small to be shared
         c = np.array(
             [
                 _solved(_basis((at - middle) / half, degree), to.T, degree)

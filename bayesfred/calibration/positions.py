@@ -17,13 +17,13 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.inverse import slopes
 from bayesfred.imaging.monomials import Exponents
+from bayesfred.model.threads import one_blas_thread
 
 __all__ = ["Method", "Positions", "broadcast_points"]
 
@@ -185,7 +185,7 @@ class Positions:
 
 def _threads(size: int) -> AbstractContextManager[object]:
     """One thread for the small matrix products of many blocks; setting that takes a millisecond."""
-    return threadpool_limits(1, user_api="blas") if size > BLOCK else nullcontext()
+    return one_blas_thread() if size > BLOCK else nullcontext()
 
 
 def broadcast_points(p: npt.ArrayLike, q: npt.ArrayLike) -> tuple[Floats, Floats]:

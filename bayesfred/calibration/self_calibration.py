@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.field import images_of
@@ -35,6 +34,7 @@ from bayesfred.model.dither_layout import POINTING
 from bayesfred.model.dithered import DitheredPosterior
 from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_statistics import CONSISTENT
@@ -331,7 +331,7 @@ def self_calibrate(
         frames, (detector, psf, field), (noise, nuisances, prior or {}),
         (pointings, pointing_sd, turns),
     )  # fmt: skip
-    with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin and take half the cores
+    with one_blas_thread():  # idle BLAS threads spin and take half the cores
         posterior, start, links = dithers.posterior()
         found = [_convention(posterior)]
         unseen, _ = lost_directions(posterior, start, dithers.prior)

@@ -53,7 +53,7 @@ def stacked(tables: Mapping[str, Table], key: str) -> Table:
     --------
     >>> one = make_table({"x": [1.0, 2.0]})
     >>> both = stacked({"a": one, "b": one[:1]}, "frame")
-    >>> list(both["frame"]), both["x"].tolist()
+    >>> both["frame"].tolist(), both["x"].tolist()
     (['a', 'a', 'b'], [1.0, 2.0, 1.0])
     """
     parts = []

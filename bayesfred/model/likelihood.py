@@ -90,19 +90,16 @@ class FrameLikelihood:
         out = np.where(wanted, 0.0, -np.inf)
         arguments, rows = self._arguments(vectors), np.arange(len(vectors))
         if self.extrapolation:
-            fast = partial(
-                extrapolated_log_likelihoods, extrapolated=self.extrapolation.at(vectors)
-            )
+            known = self.extrapolation.at(vectors)
+            fast = partial(extrapolated_log_likelihoods, extrapolated=known)
             self._evaluate(fast, arguments, out)
             rows = np.flatnonzero(np.isnan(out))
-        if rows.size:
-            left = np.where(np.isnan(out[rows]), 0.0, out[rows])
-            self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left)
-            out[rows] = left
+        left = np.where(np.isnan(out[rows]), 0.0, out[rows])
+        self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left)
+        out[rows] = left
         return out + self._constant
 
     def _evaluate(self, kernel: Callable[..., None], vectors: Vectors, out: Floats) -> None:
-        """Let a kernel fill `out` in threads."""
         turns = Turns(np.zeros(1, np.int64), out)
 
         def evaluate() -> None:

@@ -1,13 +1,18 @@
 """The threads that share an ensemble's walkers with the calling one, as many as numba may use."""
 
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import numba
+from threadpoolctl import threadpool_limits
 
 _pool: ThreadPoolExecutor | None = None
+_blas = threading.Lock()
+_blas_blocks = 0  # in which BLAS has one thread
+_blas_limits: threadpool_limits | None = None
 
 
 def share(work: Callable[[], None], most: int) -> None:
@@ -46,3 +51,24 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         numba.set_num_threads(threads)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let BLAS use one thread: idle ones spin, and take half the cores from what is at work.
+
+    The limit is the process's, so it ends with the last of `with` blocks that overlap in several
+    threads.
+    """
+    global _blas_blocks, _blas_limits
+    with _blas:
+        if _blas_blocks == 0:
+            _blas_limits = threadpool_limits(1, user_api="blas")
+        _blas_blocks += 1
+    try:
+        yield
+    finally:
+        with _blas:
+            _blas_blocks -= 1
+            if _blas_blocks == 0 and _blas_limits is not None:
+                _blas_limits.restore_original_limits()

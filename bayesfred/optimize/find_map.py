@@ -8,13 +8,13 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.determined import require_light, undetermined
 from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
@@ -180,7 +180,7 @@ def approach(
         If the start has no posterior density, or the frame cannot determine some parameters.
     """
     require_light(posterior)
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         params = find_start(posterior).params if start is None else start
         if not np.isfinite(posterior.log_prob(params)):
             raise InputError(NO_DENSITY)
@@ -200,7 +200,7 @@ def _search(
     """The posterior of what is kept, and its maximum."""
     require_light(posterior)
     # idle BLAS threads spin, and take the cores from what is at work
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         top, evaluations = None, 0
         for begun in _starts(posterior, start):
             if not np.isfinite(posterior.log_prob(begun.params)):
@@ -251,7 +251,7 @@ def _search_frames(
     start: Sequence[float] | Floats | None,
 ) -> tuple[JointPosterior, MapEstimate]:
     """The joint posterior of what is kept of several frames, and its maximum."""
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         found = maximize_frames(posterior, rejecting, start)
         joint, top = found.posterior, found.top
         judged = [

@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from scipy import spatial
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
@@ -26,6 +25,7 @@ from bayesfred.imaging.psf import FWHM, PSF, MeasuredPSF, density_at, has_pixel
 from bayesfred.imaging.psf.measured import check_choices, field_terms
 from bayesfred.imaging.psf.sampled import spline_coefficients
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.psf_equations import WIDTH, PsfEquations, PsfState, field_radius
 from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
@@ -97,7 +97,7 @@ def fit_psf(
             f"detector: binning: got {posterior.model.detector.binning}, expected 1: a measured "
             "PSF has one pixel in it; describe the frame in recorded pixels"
         )
-    with threadpool_limits(1, user_api="blas"):
+    with one_blas_thread():
         state = starting_state(posterior, estimate, float(oversampling), degree)
         equations = solved(posterior, state)
         wider = _with_wings(posterior, equations.state)

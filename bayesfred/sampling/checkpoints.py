@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from bayesfred.errors import ENDINGS
 from bayesfred.sampling.chain import Chain
 
 __all__ = ["Checkpoints", "in_memory", "uninterrupted"]
@@ -70,7 +71,8 @@ def uninterrupted() -> Iterator[None]:
     arrived: list[int] = []
     before = {
         number: signal.signal(number, lambda n, _: arrived.append(n))
-        for number in (signal.SIGINT, signal.SIGTERM)
+        for number in (signal.SIGINT, *ENDINGS)
+        if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
         yield

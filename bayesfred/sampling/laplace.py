@@ -22,13 +22,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.lock import only_writer
 from bayesfred.io.paths import may_write
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
@@ -107,7 +107,7 @@ def laplace(
         raise InputError(f"laplace: draws: got {draws}, expected at least 2")
     if path is None and overwrite:
         raise InputError("laplace: path: got none with overwrite, expected the chain file")
-    with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin and take half the cores
+    with one_blas_thread():  # idle BLAS threads spin and take half the cores
         if path is None:
             chain = _drawn(posterior, estimate, seed, draws, progress)
             return replace(chain, record=record)

@@ -18,7 +18,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
@@ -26,6 +25,7 @@ from bayesfred.io.lock import only_writer
 from bayesfred.io.memory import require_room
 from bayesfred.io.paths import may_write
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
@@ -145,7 +145,7 @@ def sample(
                 found = find_map(posterior)
         return Run(posterior, found, seed, ensembles=ensembles, walkers=walkers, record=record)
 
-    with threadpool_limits(1, user_api="blas"):  # idle BLAS threads spin and take half the cores
+    with one_blas_thread():  # idle BLAS threads spin and take half the cores
         if path is None:
             if resume or overwrite:
                 raise InputError(
@@ -168,7 +168,12 @@ def sample(
             else:
                 run = fresh()
             checkpoints = Checkpoints(lambda chain: write_chain(replace(chain, path=path)))
-            chain = run.until(target_ess, steps, checkpoints, show=progress)
+            try:
+                chain = run.until(target_ess, steps, checkpoints, show=progress)
+            except KeyboardInterrupt as stop:
+                if run.steps:
+                    stop.add_note(f"{path} holds {len(run.steps)} steps: resume it with --resume")
+                raise
             return replace(chain, path=path)
 
 
