@@ -90,11 +90,10 @@ class FrameLikelihood:
         out = np.where(wanted, 0.0, -np.inf)
         arguments, rows = self._arguments(vectors), np.arange(len(vectors))
         if self.extrapolation:
-            known = self.extrapolation.at(vectors)
-            fast = partial(extrapolated_log_likelihoods, extrapolated=known)
-            self._evaluate(fast, arguments, out)
+            known = {"extrapolated": self.extrapolation.at(vectors)}
+            self._evaluate(partial(extrapolated_log_likelihoods, **known), arguments, out)
             rows = np.flatnonzero(np.isnan(out))
-        left = np.where(np.isnan(out[rows]), 0.0, out[rows])
+        left = np.nan_to_num(out[rows], neginf=-np.inf)
         self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left)
         out[rows] = left
         return out + self._constant
@@ -102,11 +101,12 @@ class FrameLikelihood:
     def _evaluate(self, kernel: Callable[..., None], vectors: Vectors, out: Floats) -> None:
         turns = Turns(np.zeros(1, np.int64), out)
 
-        def evaluate() -> None:
+        def work() -> None:
             with self._workspace() as w:
                 kernel(self._problem, w, vectors, turns=turns)
 
-        share(evaluate, len(out))
+        if out.size:  # what nothing needs is not compiled
+            share(work, len(out))
 
     def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
         """The same likelihood, evaluated several times faster around `params` if fluxes are free.
@@ -120,10 +120,8 @@ class FrameLikelihood:
             slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if not np.isfinite(slopes[0]):
             return replace(self, extrapolation=None)
-        extrapolation = flux_extrapolation(
-            self.model, self.fluxes, rendered, z[:, 0], params, covariance
-        )
-        close = replace(self, extrapolation=extrapolation)
+        known = flux_extrapolation(self.model, self.fluxes, rendered, z[:, 0], params, covariance)
+        close = replace(self, extrapolation=known)
         # what is made of a frame is large
         vars(close).update({name: made for name, made in vars(self).items() if name[0] == "_"})
         return close
