@@ -1,8 +1,5 @@
 """Threads of BLAS: one while samplers work, and all of them again afterwards."""
 
-from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
-
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -13,29 +10,6 @@ def threads() -> set[int]:
     return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
 
 
-def overlap(limit) -> set[int]:
-    """BLAS's threads after two blocks of which the first ends while the second goes on."""
-    began, both, ended = Barrier(2), Barrier(2), Barrier(2)
-
-    def early() -> None:
-        with limit():
-            began.wait(10)
-            both.wait(10)
-        ended.wait(10)
-
-    def late() -> None:
-        began.wait(10)
-        with limit():
-            both.wait(10)
-            ended.wait(10)
-            assert threads() == {1}
-
-    with ThreadPoolExecutor(2) as pool:
-        for done in [pool.submit(early), pool.submit(late)]:
-            done.result()
-    return threads()
-
-
 @pytest.fixture(autouse=True)
 def two_threads():
     with threadpool_limits(2, user_api="blas"):
@@ -44,15 +18,14 @@ def two_threads():
         yield
 
 
-def test_blocks_that_overlap_leave_the_threads_as_they_were() -> None:
-    def both() -> None:
-        with one_blas_thread(), one_blas_thread():
-            assert threads() == {1}
-        assert threads() == {2}
-
-    both()
-    for _ in range(5):
-        assert overlap(one_blas_thread) == {2}
+def test_the_last_of_overlapping_blocks_brings_the_threads_back() -> None:
+    outer, inner = one_blas_thread(), one_blas_thread()
+    outer.__enter__()
+    inner.__enter__()
+    outer.__exit__(None, None, None)
+    assert threads() == {1}
+    inner.__exit__(None, None, None)
+    assert threads() == {2}
 
 
 def test_limits_of_each_block_leave_one_thread() -> None:
