@@ -1,37 +1,48 @@
-"""Threads of BLAS: one while samplers work, and all of them again afterwards."""
+"""Threads of BLAS: one while a sampler works, and all of them again afterwards."""
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import pytest
-from threadpoolctl import threadpool_info, threadpool_limits
+from test_sampling_protocol import CutGaussian, top
+from threadpoolctl import threadpool_info
 
-from bayesfred.model.threads import one_blas_thread
+import bayesfred as bf
 
 
 def threads() -> set[int]:
     return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
 
 
-@pytest.fixture(autouse=True)
-def two_threads():
-    with threadpool_limits(2, user_api="blas"):
-        if threads() != {2}:
-            pytest.skip("this BLAS has one thread")
-        yield
+class Held(CutGaussian):
+    """A density that tells when it is first asked, and answers when it may."""
+
+    def __init__(self, asked: Event, may_answer: Event) -> None:
+        self.asked, self.may_answer = asked, may_answer
+
+    def log_prob(self, params):
+        self.asked.set()
+        assert self.may_answer.wait(30)
+        return super().log_prob(params)
 
 
-def test_the_last_of_overlapping_blocks_brings_the_threads_back() -> None:
-    outer, inner = one_blas_thread(), one_blas_thread()
-    outer.__enter__()
-    inner.__enter__()
-    outer.__exit__(None, None, None)
-    assert threads() == {1}
-    inner.__exit__(None, None, None)
-    assert threads() == {2}
+def test_runs_that_overlap_leave_the_threads_as_they_were() -> None:
+    """The first to begin ends while the other goes on, which knows one thread alone."""
+    before = threads()
+    if max(before) == 1:
+        pytest.skip("this BLAS has one thread")
+    began, both, ended = Event(), Event(), Event()
+    estimate = top(CutGaussian())
 
+    def run(density: Held) -> None:
+        bf.sample(density, estimate, seed=1, walkers=8, steps=3, progress=False)
 
-def test_limits_of_each_block_leave_one_thread() -> None:
-    """The negative control: a block that begins within another remembers its limit."""
-    outer = threadpool_limits(1, user_api="blas")
-    inner = threadpool_limits(1, user_api="blas")
-    outer.restore_original_limits()
-    inner.restore_original_limits()
-    assert threads() == {1}
+    with ThreadPoolExecutor(2) as pool:
+        early = pool.submit(run, Held(began, both))
+        assert began.wait(30)
+        assert threads() == {1}
+        late = pool.submit(run, Held(both, ended))
+        early.result()
+        ended.set()
+        late.result()
+    assert threads() == before

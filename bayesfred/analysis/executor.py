@@ -7,7 +7,7 @@ depend on the workers or their order. Every finished task is a row of a table on
 next is waited for. A study that was stopped is resumed after its last complete row.
 
 A task that fails by what it works on has a row, which says why. One that fails by where it works,
-for want of memory or by a fault of the system, has none: it is done when the study is resumed.
+from lack of memory or by a fault of the system, has none: it is done when the study is resumed.
 """
 
 import hashlib
@@ -158,7 +158,7 @@ def run(
     InputError
         If the file exists, holds another study or rows that are not as they were written, or
         cannot be written; if the table would not fit in memory; if a worker process dies, or a task
-        fails for want of memory. What is finished is kept.
+        fails from lack of memory. What is finished is kept.
     """
     path = Path(path)
     if not path.parent.is_dir():

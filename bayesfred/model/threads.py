@@ -10,6 +10,8 @@ import numba
 from threadpoolctl import threadpool_limits
 
 _pool: ThreadPoolExecutor | None = None
+# since threadpoolctl 3.8 a limit of OpenBLAS belongs to the thread that set it
+_setter = ThreadPoolExecutor(1, "bayesfred-blas")
 _blas = threading.Lock()
 _blas_blocks = 0  # in which BLAS has one thread
 _blas_limits: threadpool_limits | None = None
@@ -35,8 +37,8 @@ def share(work: Callable[[], None], most: int) -> None:
 
 
 def _forget() -> None:
-    global _pool
-    _pool = None
+    global _pool, _setter
+    _pool, _setter = None, ThreadPoolExecutor(1, "bayesfred-blas")
 
 
 os.register_at_fork(after_in_child=_forget)
@@ -63,7 +65,7 @@ def one_blas_thread() -> Iterator[None]:
     global _blas_blocks, _blas_limits
     with _blas:
         if _blas_blocks == 0:
-            _blas_limits = threadpool_limits(1, user_api="blas")
+            _blas_limits = _setter.submit(threadpool_limits, 1, "blas").result()
         _blas_blocks += 1
     try:
         yield
@@ -71,4 +73,4 @@ def one_blas_thread() -> Iterator[None]:
         with _blas:
             _blas_blocks -= 1
             if _blas_blocks == 0 and _blas_limits is not None:
-                _blas_limits.restore_original_limits()
+                _setter.submit(_blas_limits.restore_original_limits).result()

@@ -152,7 +152,7 @@ class Chain:
             params=joint.frame_params(name, best.params),
             covariance=joint.frame_covariance(name, best.covariance),
             modes=None,
-            fits_data=True,  # which is asked of every frame anew
+            fits_data=True,  # which is asked of every frame again
         )
         record = self.record and replace(
             self.record,

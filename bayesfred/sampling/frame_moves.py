@@ -7,9 +7,9 @@ is phi ~ N(m, V) and, given phi, independently
 
 I the information. A step has two moves.
 
-1. phi is drawn anew. The own parameters of some frames are drawn with it; in the others the
+1. phi is drawn again. The own parameters of some frames are drawn with it; in the others the
    residual r_i = nu_i - B_i (phi - m) stays, which moves nu_i along. One decision for all.
-2. In those others nu_i is drawn anew given phi, and each frame decides for itself.
+2. In those others nu_i is drawn again given phi, and each frame decides for itself.
 
 Proposals for k frames at once are accepted by the sum of k log-ratios of posterior and proposal. If
 frame i's has the variance s_i^2, that of the sum is s^2 = sum s_i^2, and the draws' autocorrelation
@@ -114,7 +114,7 @@ class FrameMove(Move):  # type: ignore[misc]
         return new, self.shared.log_density(x[:, :p]) - self.shared.log_density(new[:, :p])
 
     def _redraw(self, i: int, x: Floats, random: np.random.RandomState) -> Floats:
-        """Draw the own parameters of frame i anew, in place; log q(old) - log q(new)."""
+        """Draw the own parameters of frame i again, in place; log q(old) - log q(new)."""
         own, columns = self.own[i], self.posterior.parts[i].own
         moved = self._moved(own, x)
         before, after = x[:, columns] - moved, own.residual.draw(len(x), random)

@@ -97,7 +97,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         found = super()._load_overload(sig, target_context)
         if found is None and sig not in self._compiling:
             lock = filelock.FileLock(self._lock_path(sig), PATIENCE)
-            with suppress(OSError):  # a timeout is one; where nothing can be written nobody waits
+            # a timeout is an OSError; nobody waits where nothing can be written or locked
+            with suppress(OSError, NotImplementedError):
                 lock.acquire(poll_interval=0.02)
             self._compiling[sig] = lock
             found = super()._load_overload(sig, target_context)
