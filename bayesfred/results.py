@@ -197,7 +197,7 @@ def make_chain(
     if say:
         say(f"maximum: {chain.estimate.message}")
         if chain.earlier:
-            say(f"resumed with other versions: {chain.made_with}")
+            say(f"resumed with other versions: {chain.version_history}")
     return chain
 
 

@@ -1,13 +1,16 @@
 """Threads of BLAS: one while a sampler works, and all of them again afterwards."""
 
-from concurrent.futures import ThreadPoolExecutor
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from threading import Event
 
 import pytest
 from test_sampling_protocol import CutGaussian, top
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import bayesfred as bf
+from bayesfred.sampling import sampler
 
 
 def threads() -> set[int]:
@@ -26,13 +29,12 @@ class Held(CutGaussian):
         return super().log_prob(params)
 
 
-def test_runs_that_overlap_leave_the_threads_as_they_were() -> None:
-    """The first to begin ends while the other goes on, which knows one thread alone."""
-    before = threads()
-    if max(before) == 1:
-        pytest.skip("this BLAS has one thread")
+def overlap(each_for_itself: bool) -> tuple[set[int], ...]:
+    """BLAS's threads before, within and after two runs; the first ends while the other goes on."""
+    if each_for_itself:
+        sampler.one_blas_thread = partial(threadpool_limits, 1, user_api="blas")
+    before, estimate = threads(), top(CutGaussian())
     began, both, ended = Event(), Event(), Event()
-    estimate = top(CutGaussian())
 
     def run(density: Held) -> None:
         bf.sample(density, estimate, seed=1, walkers=8, steps=3, progress=False)
@@ -40,9 +42,20 @@ def test_runs_that_overlap_leave_the_threads_as_they_were() -> None:
     with ThreadPoolExecutor(2) as pool:
         early = pool.submit(run, Held(began, both))
         assert began.wait(30)
-        assert threads() == {1}
+        within = threads()
         late = pool.submit(run, Held(both, ended))
         early.result()
         ended.set()
         late.result()
-    assert threads() == before
+    return before, within, threads()
+
+
+@pytest.mark.parametrize("each_for_itself", [False, True])
+def test_runs_that_overlap_leave_the_threads_as_they_were(each_for_itself: bool) -> None:
+    """Negative control: limits of each run's own, of which the last knows one thread alone."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        before, within, after = pool.submit(overlap, each_for_itself).result()
+    if before == {1}:
+        pytest.skip("this BLAS has one thread")
+    assert within == {1}
+    assert after == ({1} if each_for_itself else before)

@@ -101,7 +101,7 @@ def run(names_extra: tuple[str, ...] = ()) -> tuple[Any, Any]:
         "versions": {"numpy": "2.0", "bayesfred": "0.1"},
         "draws": lambda: chain[:, 2:].reshape(-1, len(names)),
         "posterior": lambda: posterior,
-        "made_with": "bayesfred 0.1, numpy 2.0",
+        "version_history": "bayesfred 0.1, numpy 2.0",
         "identity": "0" * 32,
         "record": RunRecord("A frame", made="2026-11-22T04:00:17+00:00"),
     }
@@ -320,7 +320,7 @@ def test_page_of_a_misfit_says_so_first(tmp_path: Path) -> None:
 def test_everything_a_user_writes_is_escaped(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>\u202egnp"
     chain, _ = run((evil,))
-    chain.made_with = f"{evil} {evil}"
+    chain.version_history = f"{evil} {evil}"
     chain.path = Path(evil)
     chain.record = RunRecord(evil, evil, f"{evil}\n{evil}", (evil,))
     text, page = report(tmp_path, chain=chain, result=evil)

@@ -477,7 +477,7 @@ def test_the_versions_of_every_step_are_kept(
     assert (found.versions, found.earlier) == (another, ((3, first), (7, other)))
     assert draws_of(found) == draws_of(whole)
     numpy = f"until step 3 numpy {first['numpy']}; until step 3 wheel not there"
-    assert found.made_with.endswith(
+    assert found.version_history.endswith(
         f"wheel 1; {numpy}; until step 7 numpy 9.9; until step 7 wheel not there"
     )
     write_chain(found)

@@ -189,7 +189,7 @@ def unencrypted(address: str) -> str | None:
     Examples
     --------
     >>> print(unencrypted("tcp://node:8786"))
-    --scheduler: tcp://node:8786 is neither encrypted nor authenticated: anyone who reaches its port...
+    --scheduler: tcp://node:8786 is neither encrypted nor authenticated: anyone who ...
     >>> unencrypted("tls://node:8786"), unencrypted("tcp://127.0.0.1:8786")
     (None, None)
     """
@@ -197,8 +197,8 @@ def unencrypted(address: str) -> str | None:
     if parts.scheme in ENCRYPTED or _is_loopback(parts.hostname or ""):
         return None
     return (
-        f"--scheduler: {address} is neither encrypted nor authenticated: anyone who reaches its port, "
-        "or a worker's, reads the frames and runs code as you: use tls://, see "
+        f"--scheduler: {address} is neither encrypted nor authenticated: anyone who reaches its "
+        "port, or a worker's, reads the frames and runs code as you: use tls://, see "
         "examples/many_workers.md"
     )
 

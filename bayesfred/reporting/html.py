@@ -375,7 +375,7 @@ def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]
         *how,
         ("MAP", f"{chain.estimate.message} ({chain.estimate.n_evaluations} evaluations)"),
         ("pixels used", str(diagnostics.n_pixels)),
-        ("versions", chain.made_with),
+        ("versions", chain.version_history),
     ]
 
 

@@ -104,7 +104,7 @@ class Chain:
         return hashlib.sha256(self.chain[:, 0].tobytes()).hexdigest()[:32]
 
     @property
-    def made_with(self) -> str:
+    def version_history(self) -> str:
         """The versions as a text; where the run was resumed with others, what they were before."""
         names = [f"{name} {version}" for name, version in sorted(self.versions.items())]
         before = [

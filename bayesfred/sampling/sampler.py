@@ -349,7 +349,7 @@ class Run:
     def _chain(self, target_ess: float) -> Chain:
         """The run so far, with the longest burn-in there can be: finding it takes time."""
         last, positions = self.steps[-1], self._positions()
-        made_with, earlier = self._versions()
+        made_by, earlier = self._versions()
         return Chain(
             path=None,
             density=self.posterior,
@@ -360,7 +360,7 @@ class Run:
             burn_in=most_burn_in(positions),
             seed=self.seed,
             estimate=self.estimate,
-            versions=made_with,
+            versions=made_by,
             target_ess=target_ess,
             n_invalid=last.n_invalid,
             record=self.record,
