@@ -3,6 +3,7 @@
 The clusters are real ones on this machine, whose processes are killed.
 """
 
+import asyncio
 import json
 import multiprocessing
 import os
@@ -15,10 +16,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ import pytest
 
 import bayesfred as bf
 from bayesfred._typing import Flags, Floats
-from bayesfred.analysis.dask_cluster import cluster, unencrypted
+from bayesfred.analysis.dask_cluster import DaskWorkers, cluster, unencrypted
 from bayesfred.analysis.executor import PlacedExecutor
 from bayesfred.analysis.frame_worker import Orders, Packed, kept_frames, pack, unpack
 from bayesfred.analysis.processes import Processes, processes
@@ -465,6 +467,39 @@ def test_a_dask_cluster_that_loses_a_worker_and_then_its_scheduler(tmp_path: Pat
     assert chain.chain[:, :steps].tobytes() == kept.chain.tobytes()
     resumed = bf.sample(joint, estimate, path=path, steps=steps + 2, resume=True, **how)
     assert resumed.chain.tobytes() == chain.chain.tobytes()
+
+
+def test_a_connection_that_breaks_while_an_answer_comes_is_a_lost_scheduler() -> None:
+    comm = pytest.importorskip("distributed.comm", reason="Dask's distributed is not installed")
+
+    class Client:
+        """A client whose scheduler resets its connection."""
+
+        def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+            self.loop = SimpleNamespace(asyncio_loop=loop)
+
+        def submit(self, *args: object, **options: object) -> None: ...
+
+        async def gather(self, future: object, asynchronous: bool) -> None:
+            raise comm.CommClosedError("reset")
+
+        def nthreads(self, callback_timeout: float) -> None:
+            time.sleep(callback_timeout)
+            raise OSError("nobody there")
+
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    try:
+        workers = DaskWorkers(Client(loop))
+        with pytest.raises(BrokenExecutor, match="reset"):
+            workers.submit(len, ()).result()
+        with told_within(10.0, r"--scheduler: no answer in 6 s \(nobody there\)"):
+            everything(RemoteFrames(FIXED, workers), 1)
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 def test_a_cluster_with_tls_as_the_page_says(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import logging
 import time
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,12 @@ class DaskWorkers:
         return asyncio.run_coroutine_threadsafe(self._result(there), self.client.loop.asyncio_loop)
 
     async def _result(self, there: Any) -> Any:
-        return await self.client.gather(there, asynchronous=True)
+        from distributed.comm import CommClosedError  # noqa: PLC0415 - an optional dependency
+
+        try:
+            return await self.client.gather(there, asynchronous=True)
+        except CommClosedError as error:  # the scheduler is lost: asking for its workers says so
+            raise BrokenExecutor(str(error)) from error
 
     def submit_to(self, place: str, function: Callable[..., Any], /, *args: Any) -> "Future[Any]":
         """Begin a call on a worker, or on another one if that is lost."""
