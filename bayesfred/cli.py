@@ -46,6 +46,10 @@ MapOnly = Annotated[
     bool,
     typer.Option("--map-only", help="Do not sample: maximum, and errors from the information."),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tls://HOST:PORT", help="A Dask cluster, see examples/many_workers.md."),
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the output file.")]
 
 
@@ -111,6 +115,14 @@ def fit(
     map_only: MapOnly = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    *,
+    scheduler: Scheduler = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Processes that evaluate several frames.", show_default="this one"
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Find the posterior of a frame's distortion: maximum, draws, diagnostics, report.
@@ -120,7 +132,13 @@ def fit(
     _run(
         lambda: bf.show.show_run(
             bf.commands.fit(
-                run_file, map_only=map_only, resume=resume, overwrite=overwrite, say=_say(as_json)
+                run_file,
+                map_only=map_only,
+                resume=resume,
+                overwrite=overwrite,
+                scheduler=scheduler,
+                workers=workers,
+                say=_say(as_json),
             ),
             as_json=as_json,
         )
@@ -143,10 +161,7 @@ def study(
             help="Noise levels, or simulation-based calibration.", show_default="the run file's"
         ),
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster in place of a pool."),
-    ] = None,
+    scheduler: Scheduler = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes of the pool.", show_default="one a core")
     ] = None,

@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from bayesfred import build, pipeline
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.frame_estimates import frame_estimates
+from bayesfred.analysis.remote_frames import RemoteFrames
 from bayesfred.build import naming
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import PSF, MeasuredPSF
@@ -179,7 +181,13 @@ def _kept(notes: Sequence[str]) -> list[str]:
 
 
 def fit_frames(
-    job: Job, posterior: JointPosterior, estimate: MapEstimate | None, how: How, *, say: Say | None
+    job: Job,
+    posterior: JointPosterior,
+    estimate: MapEstimate | None,
+    how: How,
+    *,
+    executor: Any | None,
+    say: Say | None,
 ) -> JointResult:
     """Sample or draw from the Laplace approximation, and write the results.
 
@@ -190,6 +198,8 @@ def fit_frames(
     estimate : MapEstimate or None
         Found if None.
     how : How
+    executor : PlacedExecutor, or anything with `submit`, or None
+        What evaluates the frames, see `RemoteFrames`; this process if None.
     say : callable or None
 
     Returns
@@ -202,7 +212,9 @@ def fit_frames(
         If the output file exists or cannot be written, or the posterior cannot be sampled.
     """
     beside = files_beside(job.output, posterior.frames)
-    chain = make_chain(job, posterior, estimate, how, beside=beside, say=say)
+    remote = executor and posterior.with_evaluator(RemoteFrames(posterior.frames, executor))
+    chain = make_chain(job, remote or posterior, estimate, how, beside=beside, say=say)
+    chain = replace(chain, density=posterior)
     target = job.run.sampling.target_ess
     return write_joint_results(
         chain, job.output, job.output, target_ess=target, overwrite=how.overwrite, say=say

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import json
+import multiprocessing
 import re
 import shutil
 from pathlib import Path
@@ -271,6 +272,33 @@ def test_resumed_steps_are_those_of_a_longer_run(folder: Path) -> None:
     (folder / "again.toml").write_text(str(record.settings))
     assert read_run(folder / "again.toml") == read_run(folder / "run.toml")
     assert record.notes[0].startswith("a: a.npy: 65 x 65 pixels")
+
+
+def test_workers_make_the_same_chain_and_are_gone_afterwards(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "run.toml").write_text(RUN.replace("target_ess = 200", "steps = 2"))
+    here = bf.commands.fit(folder / "run.toml")
+    there = bf.commands.fit(folder / "run.toml", overwrite=True, workers=2)
+    np.testing.assert_array_equal(there.chain.chain, here.chain.chain)
+    posterior = there.chain.posterior()
+    assert isinstance(posterior, bf.JointPosterior)
+    start = there.chain.estimate.params
+    assert posterior.log_prob(start) == here.chain.posterior().log_prob(start)
+    assert not multiprocessing.active_children()
+
+
+def test_workers_are_refused_where_there_is_nothing_to_share(folder: Path) -> None:
+    single = RUN[: RUN.index("[[frames]]")] + '[frame]\npath = "a.npy"\n'
+    (folder / "single.toml").write_text(single)
+    found = invoke(folder, "fit", "single.toml", "--workers", "2")
+    assert_refused(found, "single.toml: got --workers for one frame", "[[frames]]")
+    both = invoke(folder, "fit", "run.toml", "--workers", "2", "--scheduler", "tcp://[::1]:1")
+    assert_refused(both, "got both --scheduler and --workers")
+    nobody = invoke(folder, "fit", "run.toml", "--scheduler", "nonsense://")
+    assert_refused(nobody, "nonsense://", "expected a Dask scheduler's address")
+    assert not (folder / "run.h5").exists()
 
 
 def test_report_and_verify_need_the_chain_alone(

@@ -528,6 +528,18 @@ def test_a_cluster_with_tls_as_the_page_says(tmp_path: Path) -> None:
             assert (
                 values.tobytes() == LocalFrames(FIXED).log_likelihood(own[:3], wanted[:3]).tobytes()
             )
+        # the files by environment variables, as for `--scheduler`
+        variables = dict(re.findall(r"export (\w+)=(\S+)", PAGE.read_text(encoding="utf-8")))
+        assert len(variables) == 3
+        asked = (
+            "import sys; from bayesfred.analysis.dask_cluster import cluster\n"
+            "with cluster(sys.argv[1]) as workers: print(len(workers.places()))"
+        )
+        found = subprocess.run(
+            [sys.executable, "-c", asked, f"tls://127.0.0.1:{port}"], cwd=tmp_path, check=True,
+            env=os.environ | variables, capture_output=True, text=True,
+        )  # fmt: skip
+        assert found.stdout == "1\n"
         # nobody else gets in
         subprocess.run(
             shlex.split(openssl.replace("dask.", "other.")), cwd=tmp_path, check=True,

@@ -130,6 +130,7 @@ def cluster(
     ca: PathLike | None = None,
     certificate: PathLike | None = None,
     key: PathLike | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Iterator[DaskWorkers]:
     """The Dask cluster whose scheduler listens at an address.
 
@@ -141,6 +142,8 @@ def cluster(
         PEM files, for tls://: the authority that signed the scheduler's and the workers'
         certificates, one's own certificate, and its key. By default those of Dask's
         configuration, `distributed.comm.tls`.
+    say : callable, optional
+        Told what it means where the scheduler is on another machine and has no TLS.
 
     Raises
     ------
@@ -155,6 +158,8 @@ def cluster(
         raise InputError(
             "--scheduler: distributed is not installed, expected it: pip install 'bayesfred[dask]'"
         ) from None
+    if say and (line := unencrypted(address)):
+        say(line)
     names = {"tls_ca_file": ca, "tls_client_cert": certificate, "tls_client_key": key}
     given = {name: str(path) for name, path in names.items() if path is not None}
     if missing := [path for path in given.values() if not Path(path).is_file()]:

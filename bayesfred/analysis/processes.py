@@ -9,8 +9,9 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from bayesfred.errors import InputError
@@ -44,10 +45,9 @@ class Processes:
 
     def shutdown(self) -> None:
         """End the processes after their present calls."""
-        for pool in self._pools.values():
-            pool.shutdown(wait=False, cancel_futures=True)
-        for pool in self._pools.values():
-            pool.shutdown(wait=True)
+        end = partial(ProcessPoolExecutor.shutdown, cancel_futures=True)
+        with ThreadPoolExecutor(len(self._pools)) as threads:
+            list(threads.map(end, self._pools.values()))
 
 
 @contextmanager

@@ -1,12 +1,15 @@
 """Commands that make and fit frames: simulate them, fit them, report."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from bayesfred import build, joint_pipeline, pipeline, settings
 from bayesfred._typing import PathLike
+from bayesfred.analysis.dask_cluster import DaskWorkers, cluster
 from bayesfred.analysis.photons import photons_needed
+from bayesfred.analysis.processes import Processes, processes
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io import outputs, paths
@@ -120,6 +123,8 @@ def fit(
     map_only: bool = False,
     resume: bool = False,
     overwrite: bool = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
     say: Say | None = None,
 ) -> Result | JointResult:
     """Fit the frame of a run file, or its frames together: MAP, draws, diagnostics, report.
@@ -134,6 +139,10 @@ def fit(
         Resume the run in the output file.
     overwrite : bool
         Replace the output file.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers evaluate the frames, of which there are several.
+    workers : int, optional
+        Processes of this machine that do so; by default this one does.
     say : callable, optional
         Told what is known early, a line at a time. Without it no progress is shown either.
 
@@ -144,16 +153,30 @@ def fit(
     Raises
     ------
     InputError
-        If the run file, the frame or the catalogue is unusable, or the output file exists.
+        If the run file, the frame or the catalogue is unusable, the output file exists, or workers
+        are given one frame, or are given twice.
     """
     run_file = Path(run_file)
     run = read_run(run_file)
+    if scheduler and workers:
+        raise InputError("fit: got both --scheduler and --workers, expected one of them")
     given = run.output.path or Path("chains", f"{run_file.stem}.h5")
     # inside the folder in which the run is started, whatever a run file from elsewhere says
     output = paths.within(".", given, f"{run_file}: output.path")
     how = How(map_only=map_only, resume=resume, overwrite=overwrite)
     if isinstance(run, JointRun):
-        return _fit_frames(run, run_file, output, how, say)
+        with ExitStack() as stack:
+            executor: DaskWorkers | Processes | None = None
+            if scheduler:
+                executor = stack.enter_context(cluster(scheduler, say=say))
+            elif workers:
+                executor = stack.enter_context(processes(workers))
+            return _fit_frames(run, run_file, output, how, executor, say)
+    if scheduler or workers:
+        raise InputError(
+            f"{run_file}: got {'--scheduler' if scheduler else '--workers'} for one frame, "
+            "expected several, in [[frames]]: without it threads share the frame's rows"
+        )
     paths.resolve(run.frame.path, run_file, must_exist=True)
     inputs = build.inputs(run, run_file)
     paths.may_write(output, overwrite=True, inputs=inputs, beside=outputs.beside(output))
@@ -165,7 +188,12 @@ def fit(
 
 
 def _fit_frames(
-    run: JointRun, run_file: Path, output: Path, how: How, say: Say | None
+    run: JointRun,
+    run_file: Path,
+    output: Path,
+    how: How,
+    executor: DaskWorkers | Processes | None,
+    say: Say | None,
 ) -> JointResult:
     """Fit several frames together; what would be refused at the end is refused before."""
     joint_pipeline.require_frames(run, run_file)
@@ -177,7 +205,7 @@ def _fit_frames(
     may_write_run(output, how, beside, inputs)
     posterior, estimate, notes = joint_pipeline.read_frames(run, run_file, say)
     job = Job(run, run_file, output, notes, inputs=inputs)
-    return joint_pipeline.fit_frames(job, posterior, estimate, how, say=say)
+    return joint_pipeline.fit_frames(job, posterior, estimate, how, executor=executor, say=say)
 
 
 def report(

@@ -9,7 +9,7 @@ from bayesfred import build, joint_pipeline, pipeline, settings
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
-from bayesfred.analysis.dask_cluster import cluster, unencrypted
+from bayesfred.analysis.dask_cluster import cluster
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import SBCResult, simulation_based_calibration
@@ -90,11 +90,9 @@ def study(
         posterior, truth = build.simulated(run, run_file, simulation.seed)
     if s.path is None:
         outputs.make_folder(table)
-    if say and scheduler and (line := unencrypted(scheduler)):
-        say(line)
     with ExitStack() as stack:
         stack.enter_context(naming(run_file))
-        executor = stack.enter_context(cluster(scheduler)) if scheduler else None
+        executor = stack.enter_context(cluster(scheduler, say=say)) if scheduler else None
         how: dict[str, Any] = {
             "replicates": s.replicates, "seed": s.seed, "path": table, "executor": executor,
             "workers": workers, "resume": resume, "overwrite": overwrite,
