@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from bayesfred.analysis.executor import PlacedExecutor
 from bayesfred.analysis.frame_worker import kept_frames
 from bayesfred.analysis.processes import processes
 from bayesfred.analysis.remote_frames import RemoteFrames
+from bayesfred.model.threads import one_thread
 
 VECTORS = 16
 FRAMES = 20  # of the efficiency
@@ -155,8 +157,6 @@ def latency(workers: DaskWorkers, frames: int, posterior: bf.Posterior) -> float
 
 def likelihood_seconds(posterior: bf.Posterior) -> float:
     """Seconds of a thread for the likelihood of a vector."""
-    from bayesfred.model.threads import one_thread
-
     vectors, spent = around(posterior), []
     with one_thread():
         for _ in range(5):
@@ -167,16 +167,54 @@ def likelihood_seconds(posterior: bf.Posterior) -> float:
 
 
 def efficiency(workers: PlacedExecutor, posterior: bf.Posterior) -> list[float]:
-    """Time with one worker over twice that with two, of evaluations in turn; three medians."""
+    """Time with one worker over twice that with two."""
     vectors, every = around(posterior), dict.fromkeys(range(FRAMES), posterior)
     one, two = (RemoteFrames(every, Some(workers, n)) for n in (1, 2))
-    evaluations(one, vectors, 1), evaluations(two, vectors, 1)
+    return gain(lambda: evaluations(one, vectors, 1), lambda: evaluations(two, vectors, 1))
+
+
+def gain(one: Callable[[], object], two: Callable[[], object]) -> list[float]:
+    """Time of the first over twice that of the second, run in turn; three medians of five."""
+    one(), two()
     out = []
     for _ in range(3):
-        pairs = [(evaluations(one, vectors, 1), evaluations(two, vectors, 1)) for _ in range(5)]
-        first, second = np.median(np.array(pairs)[..., 0], axis=0)
+        spent = np.empty((5, 2))
+        for row in spent:
+            for k, function in enumerate((one, two)):
+                start = time.perf_counter()
+                function()
+                row[k] = time.perf_counter() - start
+        first, second = np.median(spent, axis=0)
         out.append(first / (2.0 * second))
     return out
+
+
+def ceiling() -> list[float]:
+    """The same for the likelihoods alone: what two cores of this machine do without messages."""
+    with processes(2) as workers:
+        places = workers.places()
+
+        def work(n: int) -> None:
+            calls = [workers.submit_to(place, likelihoods, FRAMES // n) for place in places[:n]]
+            for call in calls:
+                call.result()
+
+        return gain(lambda: work(1), lambda: work(2))
+
+
+@cache
+def prepared() -> bf.Posterior:
+    """A frame, in a process."""
+    return frame()
+
+
+def likelihoods(n: int) -> None:
+    """The likelihoods of n frames, by one thread of a process."""
+    posterior = prepared()
+    vectors = around(posterior)
+    with one_thread():
+        for _ in range(n):
+            posterior.likelihood.log_likelihood(vectors, np.ones(VECTORS, bool))
 
 
 def main() -> int:
@@ -190,6 +228,7 @@ def main() -> int:
     for figure, value in traffic(posterior, around(posterior)):
         tell(figure, value)
     tell(f"evaluation of {FRAMES} frames by a worker, s", FRAMES * VECTORS * seconds)
+    tell("... efficiency of 2 cores without messages", *ceiling())
     with processes(2) as workers:
         tell("... efficiency of 2 processes (wanted: 0.85)", *efficiency(workers, posterior))
     with dask(2) as cluster:
