@@ -378,9 +378,9 @@ def _run(work: "Callable[[], bool]") -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters of a path
             stream.reconfigure(errors="backslashreplace")
-    before = {  # to end as after a Ctrl-C; what is ignored, as by nohup, stays so
+    before = {  # all end as a Ctrl-C does; what is ignored, as by nohup, stays so
         number: signal.signal(number, signal.default_int_handler)
-        for number in ENDINGS
+        for number in (signal.SIGINT, *ENDINGS)
         if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:

@@ -482,7 +482,7 @@ def test_console_script_is_the_app() -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
         "scripts"
     ]
-    assert scripts == {"bayesfred": "bayesfred.cli:app"}
+    assert scripts == {"bayesfred": "bayesfred.__main__:main"}
 
 
 # --------------------------------------------------------------------------------------------------
