@@ -2,14 +2,19 @@
 
 The Fisher information plus the prior's curvature is positive definite everywhere. Newton steps with
 it in the place of the Hessian go far and converge fast where the model fits. Where it does not,
-they overshoot or crawl; there scipy's BFGS takes over, in coordinates in which that matrix is the
-identity, and learns from gradients alone how the Hessian differs from it. Where the map folds there
+they overshoot or crawl, so that the differences of gradients over the last few steps correct it:
+BFGS updates, damped as Powell does to keep it positive definite. Where that does not help, scipy's
+BFGS takes over, in coordinates in which the information is the identity. Where the map folds there
 is no density; the search meets the paraboloid that its start predicts instead. Where a prior ends,
 a Newton step goes to the highest point, within the prior's support, of the paraboloid at hand.
 Where that step vanishes is the maximum, inside the support or at its edge, where the gradient
 points out of it.
 """
 
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +30,11 @@ NEAR = 0.1  # the same where the number of steps is limited
 UNNOTICED = 1e-3  # of a log-posterior: a fall that is no reason to stop close to the maximum
 MOST_EVALUATIONS = 300  # after which no more searches begin
 
-# A Newton step is followed by another if it gains what it predicts to within this part.
-AS_PREDICTED = 0.5
+SECANTS = 10  # steps that correct the information
+LEAST_CURVATURE = 0.1  # of what is known already: less is damped
+
+# A Newton step is followed by another if it gains this part of what it predicts.
+AS_PREDICTED = 0.1
 
 
 class NewtonResult(NamedTuple):
@@ -92,32 +100,41 @@ def maximize(
     params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
     low, high = posterior.support
     close_enough = CLOSE_ENOUGH if steps is None else NEAR
+    points: deque[tuple[Floats, Floats]] = deque(maxlen=SECANTS + 1)
     while True:
         if information is None:
             information = posterior.information(params)
+        gradient = posterior.gradient(params)
         try:
-            newton = _newton_step(posterior, params, information)
+            newton = _newton_step(posterior.support, params, gradient, information)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
             unknown = np.full_like(information, np.nan)
             return NewtonResult(params, value, unknown, np.inf, evaluations)
+        points.append((params, gradient))
+        way = newton
+        if len(points) > 1:
+            with suppress(linalg.LinAlgError):
+                curvature = _corrected(information, points)
+                way = _newton_step(posterior.support, params, gradient, curvature)
         information = None
         if newton.distance < close_enough or evaluations >= MOST_EVALUATIONS or taken == steps:
             break
         gain, taken = -np.inf, taken + 1
         for fraction in 0.5 ** np.arange(10):
-            there = np.clip(params + fraction * newton.step, low, high)
+            there = np.clip(params + fraction * way.step, low, high)
             gain = float(posterior.log_prob(there)) - value
             evaluations += 1
             if newton.distance < NEAR and -UNNOTICED < gain <= 0.0:
                 # the gradient's root is the maximum: for a model error it is that of log_prob to
                 # some hundredths of a standard deviation only
-                params, value, gain = there, value + gain, newton.predicted
+                params, value, gain = there, value + gain, way.predicted
                 break
             if 0.0 < gain < np.inf:
                 params, value = there, value + gain
                 break
         gains = 0.0 < gain < np.inf
-        if gains and (steps is not None or abs(gain / newton.predicted - 1.0) < AS_PREDICTED):
+        predicted = way.predicted * fraction * (2.0 - fraction)
+        if gains and (steps is not None or gain > AS_PREDICTED * predicted):
             continue
         if steps is not None:
             break
@@ -132,10 +149,11 @@ def maximize(
     return NewtonResult(params, log_prob, newton.covariance, newton.distance, evaluations)
 
 
-def _newton_step(posterior: TargetDensity, params: Floats, information: Floats) -> _Step:
+def _newton_step(
+    support: tuple[Floats, Floats], params: Floats, gradient: Floats, information: Floats
+) -> _Step:
     """The step to the top of the paraboloid within the support; LinAlgError if it has none."""
-    low, high = posterior.support
-    gradient = posterior.gradient(params)
+    low, high = support
     information = _at_edges(information, params, gradient, (low, high))
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = 1.0 / np.sqrt(np.diag(information))  # rows differ by many orders of magnitude
@@ -152,6 +170,28 @@ def _newton_step(posterior: TargetDensity, params: Floats, information: Floats) 
         step, length = scale * shares, lower.T @ shares
     predicted = float(slope @ length - 0.5 * length @ length)
     return _Step(step, float(np.linalg.norm(length)), predicted, scale, scaled, whiten @ whiten.T)
+
+
+def _corrected(information: Floats, points: Sequence[tuple[Floats, Floats]]) -> Floats:
+    """The information with the curvature that was met between points where the gradient is known.
+
+    References
+    ----------
+    J. Nocedal & S. Wright, Numerical Optimization, 2nd ed., procedure 18.2 (damped BFGS).
+    """
+    out = information.copy()
+    for (params, gradient), (later, then) in itertools.pairwise(points):
+        step, met = later - params, gradient - then
+        known = out @ step
+        expected, found = step @ known, step @ met
+        if not (expected > 0.0 and np.isfinite(found)):
+            continue
+        if found < LEAST_CURVATURE * expected:
+            share = (1.0 - LEAST_CURVATURE) * expected / (expected - found)
+            met = share * met + (1.0 - share) * known
+            found = step @ met
+        out += np.outer(met, met) / found - np.outer(known, known) / expected
+    return out
 
 
 def _at_edges(
