@@ -369,6 +369,12 @@ SENSELESS: dict[str, Harm] = {
     "no steps": lambda file: [
         put(file, f"ensemble_{k}/chain", data=np.zeros((0, 16, 13))) for k in range(2)
     ],
+    "a draw that is no number": lambda file: put(
+        file, data=np.where(np.arange(13) == 3, np.nan, np.zeros((STEPS, 16, 13)))
+    ),
+    "more accepted moves than steps": lambda file: put(
+        file, "ensemble_1/accepted", data=np.full(16, 1e300)
+    ),
     "fewer parameters": lambda file: put(file, "estimate/params", data=np.zeros(12)),
     "covariance": lambda file: put(file, "estimate/covariance", data=np.zeros((13, 12))),
     "group for an array": lambda file: [

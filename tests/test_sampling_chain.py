@@ -767,11 +767,6 @@ def spoil_last_step(whole: Chain, path: Path, name: str, values: Floats) -> None
         ),
         (
             "chain",
-            lambda a: np.where(np.arange(8)[:, None] == 2, np.nan, a),
-            "2 of 16 walkers without posterior density",
-        ),
-        (
-            "chain",
             lambda a: np.broadcast_to(a[:, :1], a.shape),
             "the same f_ux, .* for all walkers",
         ),

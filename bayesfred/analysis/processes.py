@@ -85,6 +85,9 @@ def new_pool(n: int | None) -> ProcessPoolExecutor:
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """Hold a Ctrl-C back while a process begins: it must first learn to leave it to this one."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

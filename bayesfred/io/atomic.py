@@ -83,12 +83,20 @@ def replace(path: Path, *content: bytes | memoryview, sole_writer: bool = False)
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(temporary, path)
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            _sync(path.parent)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):
                 temporary.unlink(missing_ok=True)
             raise
+
+
+def _sync(folder: Path) -> None:
+    """Have the system write down that a file has another name, where it lets a folder be opened."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except PermissionError:  # Windows opens none; others none that may not be listed
+        return
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

@@ -22,6 +22,9 @@ from bayesfred.model.parameters import Parameter
 # scale; s are the shape parameters.
 Density = Callable[[Floats, tuple[Any, ...]], tuple[Floats, Floats, Floats]]
 
+LEAST_SCALE = 1e-100
+MOST_SHAPE = 1e6
+
 DENSITIES: dict[str, Density] = {
     "norm": lambda z, s: (-0.5 * z * z, -z, np.ones_like(z)),
     "truncnorm": lambda z, s: (-0.5 * z * z, -z, np.ones_like(z)),
@@ -94,9 +97,19 @@ def check(name: str, distribution: Any) -> None:
             "scipy.stats distribution "
             f"among {', '.join(DENSITIES)}"
         )
-    if not _standard(distribution)[2] > 0:
+    shapes, loc, scale = _standard(distribution)
+    if not LEAST_SCALE <= scale <= 1.0 / LEAST_SCALE:  # its square is a number > 0 too
         raise InputError(
-            f"prior: {name}: scale: got {_standard(distribution)[2]}, expected a number > 0"
+            f"prior: {name}: scale: got {scale}, expected a number > 0, from {LEAST_SCALE:g} to "
+            f"{1.0 / LEAST_SCALE:g}"
+        )
+    sizes = np.abs([shape for shape in shapes if shape and not np.isinf(shape)])
+    usable = np.all((sizes >= 1.0 / MOST_SHAPE) & (sizes <= MOST_SHAPE))
+    if not (abs(loc) <= 1.0 / LEAST_SCALE and usable and distribution.dist._argcheck(*shapes)):
+        raise InputError(
+            f"prior: {name}: got {family} with {', '.join(f'{x:g}' for x in (*shapes, loc))}, "
+            f"expected valid parameters of scipy.stats.{family}, shapes from {1.0 / MOST_SHAPE:g} "
+            f"to {MOST_SHAPE:g}"
         )
 
 

@@ -41,7 +41,8 @@ def _forget() -> None:
     _pool, _setter = None, ThreadPoolExecutor(1, "bayesfred-blas")
 
 
-os.register_at_fork(after_in_child=_forget)
+if hasattr(os, "register_at_fork"):  # Windows cannot fork
+    os.register_at_fork(after_in_child=_forget)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, cast, get_args
 import h5py
 import numpy as np
 
-from bayesfred._typing import PathLike
+from bayesfred._typing import Floats, Ints, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io import atomic
 from bayesfred.io.hdf5_checks import KIND, SCHEMA, open_checked, open_with_digest, seal
@@ -30,6 +30,8 @@ from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.sampling.chain import Chain, Method
 from bayesfred.sampling.record import RunRecord
+
+LARGEST = 1e100  # of a parameter: its square is a number too
 
 
 def open_chain(path: PathLike) -> Chain:
@@ -215,7 +217,7 @@ def _read(path: Path, file: h5py.File) -> Chain:
         density=_posterior(file["posterior"]),
         chain=np.stack([g["chain"][()] for g in groups]),
         log_prob=np.stack([g["log_prob"][()] for g in groups]),
-        accepted=np.stack([g["accepted"][()] for g in groups]).astype(np.int64),
+        accepted=_accepted(np.stack([g["accepted"][()] for g in groups]), groups[0]),
         random_states=tuple(_random_state(g.attrs) for g in groups),
         burn_in=int(file.attrs["burn_in"]),
         seed=int(file.attrs["seed"]),
@@ -247,14 +249,26 @@ def _read(path: Path, file: h5py.File) -> Chain:
     wrong = [name for name, (array, right) in expected.items() if array.shape != right]
     if wrong or 0 in shape:
         raise ValueError(f"shapes that do not agree: {', '.join(wrong)}")
+    numbers = chain.chain, chain.estimate.params, chain.estimate.covariance
+    if not all((np.abs(each) <= LARGEST).all() for each in numbers):
+        raise ValueError("draws or a maximum that are no numbers, or out of all proportion")
     steps = {int(g.attrs["iteration"]) for g in groups}
     if steps != {shape[1]} or not 0 <= chain.burn_in < shape[1]:
         raise ValueError("numbers of steps that do not agree")
+    if "bayesfred" not in chain.versions:
+        raise ValueError("no version of bayesfred")
     if not all(0 < steps < shape[1] for steps, _ in chain.earlier):
         raise ValueError("versions of steps that there are not")
     if not chain.estimate.message.isprintable():
         raise ValueError("texts that cannot be shown")
     return chain
+
+
+def _accepted(stored: Floats, group: Any) -> Ints:
+    """Numbers of accepted moves, which are at most those of the steps."""
+    if not np.all((stored >= 0.0) & (stored <= len(group["chain"]))):
+        raise ValueError("more accepted moves than steps")
+    return stored.astype(np.int64)
 
 
 def _posterior(group: Any) -> Posterior | JointPosterior | DitheredPosterior:
