@@ -81,7 +81,9 @@ class Section(BaseModel):
     """A table of a run file; its fields are the keys."""
 
     # strict: TOML has types of its own, so 'true' or '3' is never taken for a number.
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, protected_namespaces=()
+    )
 
 
 class DistortionSettings(Section):

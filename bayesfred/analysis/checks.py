@@ -75,7 +75,7 @@ def largest_deviate(z: float, number: int) -> float:
     one = 2.0 * special.ndtr(-abs(z))
     if one < 1e-290:  # hardly any number of tests makes a difference then
         return abs(float(z))
-    return float(-special.ndtri(-math.expm1(number * math.log1p(-one))))
+    return float(-special.ndtri(-special.expm1(number * special.log1p(-one))))
 
 
 def sums(fit: Mapping[str, float]) -> list[Check]:

@@ -77,7 +77,7 @@ def summarise(
             )
             bias, error = _mean(estimate - truth)
             scatter, least = error * math.sqrt(n), math.sqrt(_mean(bound**2)[0])
-            efficiency = least**2 / scatter**2
+            efficiency = least**2 / scatter**2 if scatter else math.nan
             own = {
                 "truth": _mean(truth)[0],
                 "width": _mean(sd)[0],

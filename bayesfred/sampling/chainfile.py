@@ -252,6 +252,10 @@ def _read(path: Path, file: h5py.File) -> Chain:
     numbers = chain.chain, chain.estimate.params, chain.estimate.covariance
     if not all((np.abs(each) <= LARGEST).all() for each in numbers):
         raise ValueError("draws or a maximum that are no numbers, or out of all proportion")
+    if not _is_covariance(chain.estimate.covariance):
+        raise ValueError("a covariance that is none")
+    if chain.seed < 0:
+        raise ValueError("no seed")
     steps = {int(g.attrs["iteration"]) for g in groups}
     if steps != {shape[1]} or not 0 <= chain.burn_in < shape[1]:
         raise ValueError("numbers of steps that do not agree")
@@ -269,6 +273,18 @@ def _accepted(stored: Floats, group: Any) -> Ints:
     if not np.all((stored >= 0.0) & (stored <= len(group["chain"]))):
         raise ValueError("more accepted moves than steps")
     return stored.astype(np.int64)
+
+
+def _is_covariance(matrix: Floats) -> bool:
+    """Whether a matrix is symmetric and positive definite."""
+    sd = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    if not (np.all(sd > 0.0) and np.array_equal(matrix, matrix.T)):
+        return False
+    try:
+        np.linalg.cholesky(matrix / np.outer(sd, sd))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _posterior(group: Any) -> Posterior | JointPosterior | DitheredPosterior:

@@ -22,7 +22,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.io.serialize import serializable
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
-from bayesfred.model.noise.poisson import poisson_cdf
+from bayesfred.model.noise.poisson import drawn, poisson_cdf
 from bayesfred.model.noise.protocol import Noise
 
 
@@ -226,8 +226,7 @@ class BackgroundNoise(_Gaussian):
             )
 
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
-        noise = rng.poisson(np.broadcast_to(background, sources.shape))
-        return np.asarray(sources + noise, np.float64)
+        return sources + drawn(np.broadcast_to(background, sources.shape), rng)
 
     def fisher_weight(self, mean: Floats, background: float | Floats) -> Floats:
         return np.ones_like(mean) / background

@@ -29,6 +29,9 @@ from bayesfred.model.noise.moments import (
 from bayesfred.model.noise.protocol import Noise
 
 NOTHING = 1e-300  # stands for an expected count of zero, at which nothing but zero can be counted
+MOST_COUNTS = 1e18  # of an expected pixel that can be drawn: more are no integers of 64 bits
+LEAST_READ_NOISE = 0.01  # below it only whole numbers of photons have any density
+MOST_READ_NOISE = 1e6
 SERIES_FROM = 1e3
 SMALL_UNTIL = 1e-6
 
@@ -112,20 +115,20 @@ class PoissonNoise(Noise):
             read_noise = np.array(self.read_noise, dtype=np.float64)
         except (TypeError, ValueError):
             raise InputError("noise: read_noise: got no numbers, expected counts") from None
-        bad = ~(np.isfinite(read_noise) & (read_noise >= 0.0))
+        bad = ~((read_noise >= LEAST_READ_NOISE) & (read_noise <= MOST_READ_NOISE))
         if not read_noise.ndim:
-            if bad:
+            if bad and read_noise != 0.0:
                 raise InputError(
-                    f"noise: read_noise: got {self.read_noise}, expected a standard deviation >= 0 "
-                    "in counts"
+                    f"noise: read_noise: got {self.read_noise}, expected a standard deviation in "
+                    f"counts, from {LEAST_READ_NOISE:g} to {MOST_READ_NOISE:g}, or 0"
                 )
             object.__setattr__(self, "read_noise", float(read_noise))
             return
-        bad |= read_noise == 0.0
         if bad.any():
             raise InputError(
                 f"noise: read_noise: got {read_noise[bad][0]:g} in {bad.sum()} pixels, expected "
-                "positive numbers: mask such pixels and give them any read noise"
+                f"numbers from {LEAST_READ_NOISE:g} to {MOST_READ_NOISE:g}: mask such pixels and "
+                "give them any read noise"
             )
         read_noise.flags.writeable = False
         object.__setattr__(self, "read_noise", read_noise)
@@ -183,7 +186,7 @@ class PoissonNoise(Noise):
         return np.asarray(xlogy(counts, np.maximum(counts, NOTHING)) - counts)
 
     def draw(self, sources: Floats, background: float | Floats, rng: np.random.Generator) -> Floats:
-        counts = rng.poisson(sources + background).astype(np.float64)
+        counts = drawn(sources + background, rng)
         if self.discrete:
             return counts
         return counts + rng.normal(0.0, self.read_noise, counts.shape)
@@ -330,3 +333,19 @@ def _deviance_table() -> CubicSpline:
         mean = chance @ deviance
         moments[k] = mean, chance @ (deviance - mean) ** 2
     return CubicSpline(np.log(grid), np.log(moments))
+
+
+def drawn(expected: Floats, rng: np.random.Generator) -> Floats:
+    """Counts with Poisson noise.
+
+    Raises
+    ------
+    InputError
+        If counts are expected that no random numbers are as large as.
+    """
+    if not np.all((expected >= 0.0) & (expected <= MOST_COUNTS)):
+        raise InputError(
+            f"counts: got up to {expected.max():.3g} expected in a pixel, expected numbers from 0 "
+            f"to {MOST_COUNTS:g}: check fluxes, background, distortion and the sources' positions"
+        )
+    return rng.poisson(expected).astype(np.float64)
