@@ -109,6 +109,27 @@ def test_far_from_it_log_prob_is_the_same(case: str) -> None:
         assert extrapolated == pytest.approx(searched, rel=1e-12, abs=ENOUGH)
 
 
+def test_a_vector_has_the_same_bits_whatever_others_there_are() -> None:
+    """A frame's vectors are shared out among any number of workers."""
+    random = np.random.default_rng(3)
+    apart = 0
+    for sources, d in ((64, 22), (400, 70), (9, 5)):
+        nothing: Any = None
+        beliefs = FluxExtrapolation(
+            nothing, np.zeros(d), np.ones(sources), random.standard_normal((sources, d)), nothing,
+            (nothing,) * 6,
+        )  # fmt: skip
+        vectors = random.standard_normal((33, d))
+        every = beliefs.at(vectors)
+        for n in range(1, 33):
+            some = beliefs.at(vectors[:n])
+            assert some.fluxes.tobytes() == every.fluxes[:n].tobytes()
+            # negative control: a matrix product
+            product = (vectors @ beliefs.slope.T)[:n].tobytes()
+            apart += (vectors[:n] @ beliefs.slope.T).tobytes() != product
+    assert apart
+
+
 def changed(near: Posterior, **parts: Any) -> Posterior:
     """The same with other beliefs about the fluxes."""
     assert isinstance(near.extrapolation, FluxExtrapolation)

@@ -29,9 +29,9 @@ class FluxExtrapolation(NamedTuple):
 
     def at(self, vectors: Floats) -> Extrapolated:
         """For parameter vectors of shape (n, d)."""
-        return Extrapolated(
-            self.fluxes + (vectors - self.params) @ self.slope.T, self.clusters, *self.hessian
-        )
+        # not `@`, whose bits depend on n
+        moved = np.einsum("nd,sd->ns", vectors - self.params, self.slope)
+        return Extrapolated(self.fluxes + moved, self.clusters, *self.hessian)
 
 
 def flux_extrapolation(
