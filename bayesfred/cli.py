@@ -10,7 +10,7 @@ import signal
 import sys
 from enum import StrEnum
 from functools import partial
-from importlib import resources
+from importlib import metadata, resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +18,7 @@ import typer
 
 import bayesfred as bf
 from bayesfred.errors import ENDINGS, InputError
+from bayesfred.io.reading import require_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,6 +60,24 @@ def _example() -> str:
     return "\n\n".join("\b\n" + paragraph for paragraph in text.strip().split("\n\n"))
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"bayesfred {metadata.version('bayesfred')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    """Take the options that no command needs."""
+
+
 @app.command()
 def demo(
     folder: Annotated[Path, typer.Option(help="Where demo.h5, demo.html and demo.png go.")] = Path(
@@ -85,7 +104,10 @@ def demo(
 @app.command()
 def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
     """Simulate the frame that [simulation] describes, and its source grid, if it has one."""
-    _run(lambda: bf.show.show_simulated(bf.commands.simulate_frame(run_file, overwrite=overwrite)))
+    _run(
+        lambda: bf.show.show_simulated(bf.commands.simulate_frame(run_file, overwrite=overwrite)),
+        run_file,
+    )
 
 
 @app.command()
@@ -141,7 +163,8 @@ def fit(
                 say=_say(as_json),
             ),
             as_json=as_json,
-        )
+        ),
+        run_file,
     )
 
 
@@ -180,14 +203,15 @@ def study(
                 overwrite=overwrite,
                 say=print,
             )
-        )
+        ),
+        run_file,
     )
 
 
 @app.command()
 def design(run_file: Run, overwrite: Overwrite = False) -> None:
     """Before the exposure: the errors that a frame would have, the best sources and pointings."""
-    _run(lambda: bf.show.show_design(bf.commands.design(run_file, overwrite=overwrite)))
+    _run(lambda: bf.show.show_design(bf.commands.design(run_file, overwrite=overwrite)), run_file)
 
 
 @app.command()
@@ -216,10 +240,16 @@ def report(
     _run(
         lambda: bf.show.show_run(
             bf.commands.report(
-                chain_file, target_ess=target_ess, corner=names, out=out, overwrite=overwrite
+                chain_file,
+                target_ess=target_ess,
+                corner=names,
+                out=out,
+                overwrite=overwrite,
+                say=_say(as_json),
             ),
             as_json=as_json,
-        )
+        ),
+        chain_file,
     )
 
 
@@ -241,7 +271,8 @@ def compare(
     _run(
         lambda: bf.show.show_comparison(
             bf.commands.compare(chain_files, out=out, overwrite=overwrite)
-        )
+        ),
+        *chain_files,
     )
 
 
@@ -254,7 +285,8 @@ def crosscheck(
     _run(
         lambda: bf.show.show_cross_check(
             bf.commands.crosscheck(run_file, say=None if as_json else print), as_json=as_json
-        )
+        ),
+        run_file,
     )
 
 
@@ -314,7 +346,7 @@ def calibration(
             )
         )
 
-    _run(work)
+    _run(work, chain_file)
 
 
 @app.command()
@@ -365,7 +397,10 @@ def verify(
     ] = False,
 ) -> None:
     """Compute again what a chain file holds: hashes, log-probabilities, maximum, first steps."""
-    _run(lambda: bf.show.show_verification(bf.commands.verify(chain_file, every_draw=every_draw)))
+    _run(
+        lambda: bf.show.show_verification(bf.commands.verify(chain_file, every_draw=every_draw)),
+        chain_file,
+    )
 
 
 def _say(as_json: bool) -> "Callable[[str], None]":
@@ -373,8 +408,11 @@ def _say(as_json: bool) -> "Callable[[str], None]":
     return partial(typer.echo, err=True) if as_json else print
 
 
-def _run(work: "Callable[[], bool]") -> None:
-    """Do a command's work, which says whether all is well, and turn the outcome into exit codes."""
+def _run(work: "Callable[[], bool]", *files: Path) -> None:
+    """Do a command's work, which says whether all is well, and turn the outcome into exit codes.
+
+    Files that it needs are asked for first: to import what works takes seconds.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters of a path
             stream.reconfigure(errors="backslashreplace")
@@ -384,6 +422,12 @@ def _run(work: "Callable[[], bool]") -> None:
         if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
+        for file in files:
+            require_file(file)
+        from bayesfred.sampling.progress import working  # noqa: PLC0415 - this takes time, too
+
+        with working("loading"):
+            _ = bf.commands, bf.show
         well = work()
     except InputError as error:
         typer.echo(f"bayesfred: {error}", err=True)

@@ -6,7 +6,6 @@ own. What is sampled and judged is the posterior of all.
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,7 +44,7 @@ from bayesfred.results import (
     write_sources,
 )
 from bayesfred.sampling.chain import Chain
-from bayesfred.sampling.progress import searching
+from bayesfred.sampling.progress import working
 from bayesfred.sampling.record import LONGEST, RunRecord
 
 __all__ = ["files_beside", "fit_frames", "read_frames", "require_frames", "write_joint_results"]
@@ -113,7 +112,7 @@ def read_frames(
             raise InputError(f"{error} (frame {name})") from None
         alone.append(estimate)
         notes += [f"{name}: {line}" for line in lines]
-    with naming(run_file), searching() if say else nullcontext():
+    with naming(run_file), working(show=say is not None):
         joint = _joint(run, frames)
         start, found = _start(joint, alone), None
         if any(isinstance(frame.model.psf, MeasuredPSF) for frame in frames.values()):
@@ -285,19 +284,21 @@ def write_joint_results(
     page, picture, sources = outputs.beside(page)
     shared = chain.parameter_names[: posterior.n_shared]
     shown = corner_parameters(chain.draws()[:, : len(shared)], shared, corner)
-    diagnostics = diagnose(chain, target_ess=target_ess)
+    with working("judging the fit", show=say is not None):
+        diagnostics = diagnose(chain, target_ess=target_ess)
     if not overwrite:  # asked again, as what was not there may have come while the run was made
         marks.may_replace(chain.identity, *files_beside(page, posterior.frames))
     results = {}
     for name, judged in diagnostics.frames.items():
         if say:
-            say(f"{name}: writing its page")
+            say(f"{name}: drawing its page")
         alone = replace(chain.frame(name), record=_record_of(chain, name))
         pairs = [parameter for parameter in corner if parameter in alone.parameter_names]
         own = outputs.of_frame(page, name)
-        result = write_page(
-            alone, path, own, diagnostics=judged, corner=pairs, home=page, overwrite=overwrite
-        )
+        with working("drawing it", show=say is not None):
+            result = write_page(
+                alone, path, own, diagnostics=judged, corner=pairs, home=page, overwrite=overwrite
+            )
         results[name] = replace(result, sources=sources)
     table, estimates = diagnostics.summary(chain), frame_estimates(chain)
     common = _with_corner(table[: len(shared)], results)

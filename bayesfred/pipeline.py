@@ -3,7 +3,6 @@
 Nothing is printed. What should be known while a step works goes to `say`, one line at a time.
 """
 
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_mes
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.records import Result
 from bayesfred.results import How, Job, Say, make_chain, write_results
-from bayesfred.sampling.progress import searching
+from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
 
 __all__ = ["fit_frame", "read_frame"]
@@ -73,7 +72,7 @@ def read_frame(
     note(frame.description, line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = psf or build.reference_psf(run, run_file)
-    with searching("finding the sources") if say else nullcontext():
+    with working("finding the sources", show=say is not None):
         sources, lines = find_sources(run, run_file, shape, psf, frame)
     note(*lines)
     counts, noise = bright(run, run_file, frame, noise)
@@ -82,23 +81,23 @@ def read_frame(
         posterior = build.posterior_given(run, model, counts, frame.valid, noise)
         estimate, rough = None, isinstance(psf, PSFToMeasure)
         if posterior.nuisances.footprint is not None:
-            with searching() if say else nullcontext():
+            with working(show=say is not None):
                 posterior, estimate, lines = _follow(posterior, rough=rough)
             note(*lines)
         if f.reject_outliers:
-            with searching() if say else nullcontext():
+            with working(show=say is not None):
                 start = None if estimate is None else estimate.params
                 reject = partial(approach, rejecting=True) if rough else reject_outliers
                 kept, estimate = reject(posterior, start)
             note(_census(posterior, kept))
             posterior = kept
         if run.distortion.terms == "choose":
-            with searching() if say else nullcontext():
+            with working(show=say is not None):
                 choice = choose_terms(posterior)
             posterior, estimate = choice.posterior, choice.estimate
             note(*choice.lines())
         if has_pixel(posterior.model.psf) or rough:
-            with searching("measuring the PSF") if say else nullcontext():
+            with working("measuring the PSF", show=say is not None):
                 posterior, estimate = _with_measured_psf(posterior, estimate, psf, run)
             note(psf_message(posterior))
     return posterior, estimate, notes
@@ -180,4 +179,6 @@ def fit_frame(
         beside += (outputs.psf_beside(job.output),)
     chain = make_chain(job, posterior, estimate, how, beside=beside, say=say)
     target = job.run.sampling.target_ess
-    return write_results(chain, job.output, job.output, target_ess=target, overwrite=how.overwrite)
+    return write_results(
+        chain, job.output, job.output, target_ess=target, overwrite=how.overwrite, say=say
+    )

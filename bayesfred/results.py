@@ -28,6 +28,7 @@ from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.laplace import laplace
+from bayesfred.sampling.progress import working
 from bayesfred.sampling.record import LONGEST, RunRecord
 from bayesfred.sampling.sampler import sample
 from bayesfred.sections import toml
@@ -220,6 +221,7 @@ def write_results(
     target_ess: float,
     corner: Sequence[str] = (),
     overwrite: bool,
+    say: Say | None = None,
 ) -> Result:
     """Judge a chain, and write its page, picture and table of sources.
 
@@ -236,6 +238,8 @@ def write_results(
         Parameters to show in pairs; by default chosen.
     overwrite : bool
         Replace files that this run did not make, too.
+    say : callable, optional
+        Without it no progress is shown.
 
     Returns
     -------
@@ -247,10 +251,12 @@ def write_results(
         If a file cannot be written or is another's, or `corner` names what is no parameter.
     """
     corner_parameters(chain.draws(), chain.parameter_names, corner)  # refuses before judging
-    diagnostics = diagnose(chain, target_ess=target_ess)
-    result = write_page(
-        chain, path, page, diagnostics=diagnostics, corner=corner, overwrite=overwrite
-    )
+    with working("judging the fit", show=say is not None):
+        diagnostics = diagnose(chain, target_ess=target_ess)
+    with working("drawing the report", show=say is not None):
+        result = write_page(
+            chain, path, page, diagnostics=diagnostics, corner=corner, overwrite=overwrite
+        )
     write_sources(result.sources, diagnostics, chain.identity)
     return result
 

@@ -1276,7 +1276,9 @@ def messages(text: str) -> list[str]:
     """Lines on standard error that are not progress."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", text)  # colours
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "\n", text)  # what moves the cursor
-    progress = re.compile(r"\s*|. searching for .*|sampling [━╸╺ ]+ (\d+ steps )?[\d:. -]*")
+    progress = re.compile(
+        r"\s*|. (searching for|loading|judging|drawing) ?.*|sampling [━╸╺ ]+ (\d+ steps )?[\d:. -]*"
+    )
     return [line for line in text.splitlines() if not progress.fullmatch(line)]
 
 

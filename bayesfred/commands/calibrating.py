@@ -1,6 +1,5 @@
 """Commands that hand a calibration over, and use it."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from bayesfred.reporting.style import png
 from bayesfred.results import Say
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
-from bayesfred.sampling.progress import searching
+from bayesfred.sampling.progress import working
 
 __all__ = ["FORMATS", "calibration", "correct"]
 
@@ -91,7 +90,7 @@ def calibration(
     maps, picture = (path.with_suffix(s) for s in (".fits", ".png"))
     beside = () if form else (maps, picture)
     paths.may_write(path, overwrite=overwrite, beside=beside, inputs=(chain_file,))
-    with searching("judging the fit") if say else nullcontext():
+    with working("judging the fit", show=say is not None):
         known = Calibration.from_chain(chain)
     if form is None:
         step = max(known.detector.fine_shape) / STEPS

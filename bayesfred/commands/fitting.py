@@ -215,6 +215,7 @@ def report(
     corner: Sequence[str] = (),
     out: PathLike | None = None,
     overwrite: bool = False,
+    say: Say | None = None,
 ) -> Result | JointResult:
     """Judge a chain file again, and write its page and picture.
 
@@ -230,6 +231,8 @@ def report(
         The page, .html; by default beside the chain. The other files go beside the page.
     overwrite : bool
         Replace page, picture and table.
+    say : callable, optional
+        Told which of several frames is reported on. Without it no progress is shown either.
 
     Returns
     -------
@@ -254,6 +257,8 @@ def report(
     ess = target_ess or chain.target_ess
     if isinstance(posterior, JointPosterior):
         return joint_pipeline.write_joint_results(
-            chain, path, page, target_ess=ess, corner=corner, overwrite=overwrite
+            chain, path, page, target_ess=ess, corner=corner, overwrite=overwrite, say=say
         )
-    return write_results(chain, path, page, target_ess=ess, corner=corner, overwrite=overwrite)
+    return write_results(
+        chain, path, page, target_ess=ess, corner=corner, overwrite=overwrite, say=say
+    )

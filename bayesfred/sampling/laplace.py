@@ -17,7 +17,6 @@ L. Tierney & J. B. Kadane (1986), JASA 81, 82.
 A. Kong, J. S. Liu, W. H. Wong (1994), JASA 89, 278: the effective sample size of weighted draws.
 """
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +33,7 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import write_chain
 from bayesfred.sampling.moves import LaplaceMove
-from bayesfred.sampling.progress import searching
+from bayesfred.sampling.progress import working
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import check_estimate, check_output, versions
 
@@ -125,7 +124,7 @@ def _drawn(
     posterior: TargetDensity, estimate: MapEstimate | None, seed: int, n: int, progress: bool
 ) -> Chain:
     if estimate is None:
-        with searching() if progress else nullcontext():
+        with working(show=progress):
             estimate = find_map(posterior)
     check_estimate(posterior, estimate)
     move = LaplaceMove.of(posterior, estimate, heavy_share=0.0)

@@ -12,17 +12,24 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-__all__ = ["progress_bar", "searching"]
+__all__ = ["progress_bar", "working"]
+
+SEARCHING = "searching for the maximum (the first run on a machine compiles: half a minute)"
 
 INTERVAL = 30.0  # seconds between lines
 
 
-def searching(what: str = "searching for the maximum") -> AbstractContextManager[Any]:
-    """Says in a terminal, within its `with` block, what is being done."""
+def working(what: str = SEARCHING, *, show: bool = True) -> AbstractContextManager[Any]:
+    """Says in a terminal, within its `with` block, what is being done.
+
+    Parameters
+    ----------
+    what : str
+    show : bool
+        Whether anything is shown at all.
+    """
     console = _standard_error()
-    if not _live(console):
-        return nullcontext()
-    return console.status(f"{what} (the first run on a machine compiles: half a minute)")
+    return console.status(what) if show and _live(console) else nullcontext()
 
 
 @contextmanager

@@ -12,7 +12,6 @@ stopped can be resumed.
 import math
 import platform
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -32,7 +31,7 @@ from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import changed_parts, fingerprint, open_chain, write_chain
 from bayesfred.sampling.checkpoints import Checkpoints, in_memory
 from bayesfred.sampling.ensembles import Step, advance, begin, check_start
-from bayesfred.sampling.progress import progress_bar, searching
+from bayesfred.sampling.progress import progress_bar, working
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.stopping import (
     FIRST_CHECK,
@@ -141,7 +140,7 @@ def sample(
     def fresh() -> Run:
         found = estimate
         if found is None:
-            with searching() if progress else nullcontext():
+            with working(show=progress):
                 found = find_map(posterior)
         return Run(posterior, found, seed, ensembles=ensembles, walkers=walkers, record=record)
 
