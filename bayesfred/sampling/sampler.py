@@ -189,12 +189,17 @@ def check_output(path: Path, posterior: TargetDensity) -> dict[str, str]:
 
 
 def check_estimate(posterior: TargetDensity, estimate: MapEstimate) -> None:
-    """Refuse the maximum of a posterior with other parameters."""
+    """Refuse the maximum of a posterior with other parameters, or of another one."""
     expected = len(posterior.parameter_names)
     if np.shape(estimate.params) != (expected,):
         raise InputError(
             f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
             "this posterior's maximum"
+        )
+    if not np.isfinite(posterior.log_prob(estimate.params)):
+        raise InputError(
+            "estimate: got parameters without posterior density, expected a maximum: find this "
+            "posterior's maximum"
         )
 
 
