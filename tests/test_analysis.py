@@ -206,6 +206,7 @@ def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None 
         mask=np.ones(SHAPE, bool) if mask is None else mask,
         parameter_names=("flux_scale", "background"),
         n_parameters=2,
+        log_prob=lambda params: 0.0,
         noise=noise,
         nuisances=Nuisances("scale"),
         model=SimpleNamespace(
