@@ -333,7 +333,7 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         (
             "noise",
             "read_noise = -1",
-            "noise.read_noise: got -1.0, expected a standard deviation >= 0 in counts",
+            "noise.read_noise: got -1.0, expected a standard deviation in counts, from 0.01",
         ),
         (
             "noise",
