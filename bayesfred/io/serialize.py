@@ -42,6 +42,7 @@ T = TypeVar("T")
 KEY = re.compile(r"\w[\w-]*")  # of a mapping, or several joined by dots
 
 LARGEST_CHUNK = 2**24  # bytes
+DEEPEST = 50  # groups in one another
 TAGS = ("kind", "keys")  # names that no field has
 TUPLE, MAPPING, DISTRIBUTION = "tuple", "mapping", "distribution"
 
@@ -172,10 +173,7 @@ def read(group: Any, expected: type[T]) -> T:
         The group holds something else, a field is missing or of another type, the kind is not
         registered, or the constructor refuses the values.
     """
-    try:
-        value = _get_group(group)
-    except RecursionError:
-        raise _wrong(group, "got groups nested too deeply, expected an object") from None
+    value = _get_group(group)
     if not isinstance(value, expected):
         raise _wrong(group, f"got {type(value).__name__}, expected {expected.__name__}")
     return value
@@ -258,6 +256,8 @@ def _wrong(group: Any, what: str) -> InputError:
 
 def _get_group(group: Any) -> Any:
     """The object, mapping or distribution that a group holds."""
+    if group.name.count("/") > DEEPEST:
+        raise _wrong(group, "got groups nested too deeply, expected an object")
     kind = _get(group, "kind") if "kind" in group.attrs else None
     if not isinstance(kind, str):
         raise _wrong(group, "got a group without a kind, expected one that says what it holds")
