@@ -140,7 +140,9 @@ def act(folder: Path, chance: random.Random, done: Counter[str]) -> None:
         raise LossError(f"{words}: a traceback: {said}")
     if code in (2, 130) and not WORDS.fullmatch(said.splitlines()[-1]):
         raise LossError(f"{words}: {said}")
-    if code not in (0, 2, 3, 130, -signal.SIGKILL, *(-n for n in ENDINGS if number == n)):
+    # an interrupt inside `exec` makes Python end by SIGINT, which a shell calls 130, too
+    ended = (130, -signal.SIGINT, -signal.SIGKILL, -number) if number else ()
+    if code not in (0, 2, 3, *ended):
         raise LossError(f"{words}: exit code {code}: {said}")
     replaced = f"{name}.{'h5' if command == 'fit' else 'ecsv'}" if more == "--overwrite" else ""
     try:
