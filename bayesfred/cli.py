@@ -271,8 +271,7 @@ def compare(
     _run(
         lambda: bf.show.show_comparison(
             bf.commands.compare(chain_files, out=out, overwrite=overwrite)
-        ),
-        *chain_files,
+        )
     )
 
 
