@@ -5,11 +5,7 @@ sampled well, or the model does not fit the counts, or a check does not hold; 13
 terminated with everything saved.
 """
 
-import io
-import signal
-import sys
 from enum import StrEnum
-from functools import partial
 from importlib import metadata, resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import bayesfred as bf
-from bayesfred.errors import ENDINGS, InputError
-from bayesfred.io.reading import require_file
+from bayesfred.errors import InputError
+from bayesfred.terminal import run, say_to
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    pass
 
 app = typer.Typer(
     help="Posterior of an imaging system's field distortion, from a frame of photon counts.",
@@ -91,10 +87,10 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Simulate the paper's frame, fit it and report: 81 sources, 12 terms, Poisson counts."""
-    _run(
+    run(
         lambda: bf.show.show_run(
             bf.commands.demo(
-                folder, seed=seed, map_only=map_only, overwrite=overwrite, say=_say(as_json)
+                folder, seed=seed, map_only=map_only, overwrite=overwrite, say=say_to(as_json)
             ),
             as_json=as_json,
         )
@@ -104,7 +100,7 @@ def demo(
 @app.command()
 def simulate(run_file: Run, overwrite: Overwrite = False) -> None:
     """Simulate the frame that [simulation] describes, and its source grid, if it has one."""
-    _run(
+    run(
         lambda: bf.show.show_simulated(bf.commands.simulate_frame(run_file, overwrite=overwrite)),
         run_file,
     )
@@ -126,7 +122,7 @@ def init(
     overwrite: Overwrite = False,
 ) -> None:
     """Propose a run file: gain, pedestal and read noise from the frame's own noise."""
-    _run(
+    run(
         lambda: bf.show.show_proposal(bf.commands.init(frame, second, out=out, overwrite=overwrite))
     )
 
@@ -151,7 +147,7 @@ def fit(
 
     Of several frames, in [[frames]], it is the posterior of the lens that they share.
     """
-    _run(
+    run(
         lambda: bf.show.show_run(
             bf.commands.fit(
                 run_file,
@@ -160,7 +156,7 @@ def fit(
                 overwrite=overwrite,
                 scheduler=scheduler,
                 workers=workers,
-                say=_say(as_json),
+                say=say_to(as_json),
             ),
             as_json=as_json,
         ),
@@ -192,7 +188,7 @@ def study(
     overwrite: Overwrite = False,
 ) -> None:
     """Fit many simulated frames: how well can a distortion be known, and do error bars hold."""
-    _run(
+    run(
         lambda: bf.show.show_study(
             bf.commands.study(
                 run_file,
@@ -211,7 +207,7 @@ def study(
 @app.command()
 def design(run_file: Run, overwrite: Overwrite = False) -> None:
     """Before the exposure: the errors that a frame would have, the best sources and pointings."""
-    _run(lambda: bf.show.show_design(bf.commands.design(run_file, overwrite=overwrite)), run_file)
+    run(lambda: bf.show.show_design(bf.commands.design(run_file, overwrite=overwrite)), run_file)
 
 
 @app.command()
@@ -237,7 +233,7 @@ def report(
 ) -> None:
     """Judge a chain file again and write its report, .html and .png."""
     names = [name.strip() for name in corner.split(",") if name.strip()]
-    _run(
+    run(
         lambda: bf.show.show_run(
             bf.commands.report(
                 chain_file,
@@ -245,7 +241,7 @@ def report(
                 corner=names,
                 out=out,
                 overwrite=overwrite,
-                say=_say(as_json),
+                say=say_to(as_json),
             ),
             as_json=as_json,
         ),
@@ -268,7 +264,7 @@ def compare(
     overwrite: Overwrite = False,
 ) -> None:
     """Rank models of one frame by how well they predict sources that are left out."""
-    _run(
+    run(
         lambda: bf.show.show_comparison(
             bf.commands.compare(chain_files, out=out, overwrite=overwrite)
         )
@@ -281,7 +277,7 @@ def crosscheck(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Fit two halves of the sources apart: are the errors too small, right or too large."""
-    _run(
+    run(
         lambda: bf.show.show_cross_check(
             bf.commands.crosscheck(run_file, say=None if as_json else print), as_json=as_json
         ),
@@ -345,7 +341,7 @@ def calibration(
             )
         )
 
-    _run(work, chain_file)
+    run(work, chain_file)
 
 
 @app.command()
@@ -373,7 +369,7 @@ def correct(
     overwrite: Overwrite = False,
 ) -> None:
     """Resample a frame to undistorted coordinates: counts, errors, mask, WCS."""
-    _run(
+    run(
         lambda: bf.show.show_corrected(
             bf.commands.correct(
                 frame,
@@ -396,47 +392,7 @@ def verify(
     ] = False,
 ) -> None:
     """Compute again what a chain file holds: hashes, log-probabilities, maximum, first steps."""
-    _run(
+    run(
         lambda: bf.show.show_verification(bf.commands.verify(chain_file, every_draw=every_draw)),
         chain_file,
     )
-
-
-def _say(as_json: bool) -> "Callable[[str], None]":
-    """Where lines go that are told while a command works."""
-    return partial(typer.echo, err=True) if as_json else print
-
-
-def _run(work: "Callable[[], bool]", *files: Path) -> None:
-    """Do a command's work, which says whether all is well, and turn the outcome into exit codes.
-
-    Files that it needs are asked for first: to import what works takes seconds.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack characters of a path
-            stream.reconfigure(errors="backslashreplace")
-    before = {  # all end as a Ctrl-C does; what is ignored, as by nohup, stays so
-        number: signal.signal(number, signal.default_int_handler)
-        for number in (signal.SIGINT, *ENDINGS)
-        if signal.getsignal(number) is not signal.SIG_IGN
-    }
-    try:
-        for file in files:
-            require_file(file)
-        from bayesfred.sampling.progress import working  # noqa: PLC0415 - this takes time, too
-
-        with working("loading"):
-            _ = bf.commands, bf.show
-        well = work()
-    except InputError as error:
-        typer.echo(f"bayesfred: {error}", err=True)
-        raise typer.Exit(2) from None
-    except KeyboardInterrupt as stop:
-        kept = "; ".join(getattr(stop, "__notes__", []))
-        typer.echo(f"bayesfred: interrupted; {kept or 'nothing had to be saved'}", err=True)
-        raise typer.Exit(130) from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if not well:
-        raise typer.Exit(3)

@@ -1316,6 +1316,7 @@ def test_an_interrupt_says_what_is_true(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("bayesfred.commands.verify", stopped)
+    (tmp_path / "run.h5").touch()
     output = invoke(tmp_path, "verify", "run.h5")
     assert output.code == 130
     assert output.stderr.splitlines() == ["bayesfred: interrupted; nothing had to be saved"]

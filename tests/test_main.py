@@ -40,7 +40,7 @@ import signal, sys, time
 import bayesfred as bf
 from bayesfred import __main__
 signal.signal(signal.SIGINT, signal.default_int_handler)
-sys.argv = ["bayesfred", "verify", "run.h5"]
+sys.argv = ["bayesfred", "verify", __main__.__file__]
 """
 
 

@@ -45,7 +45,7 @@ from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
 from bayesfred.sampling.laplace import importance_efficiency
-from bayesfred.sampling.sampler import check_estimate
+from bayesfred.sampling.sampler import check_density
 from bayesfred.sampling.summary import summary
 
 __all__ = ["Diagnostics", "autocorrelation_time", "diagnose"]
@@ -267,7 +267,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
     `background_estimate` and `chi2_paper`. Kallioinen et al. (2024) for the sensitivities.
     """
     posterior, best = chain.posterior(), chain.estimate
-    check_estimate(posterior, best)
+    check_density(posterior, best)
     names = chain.parameter_names
     kept = chain.chain[:, chain.burn_in :]
     n_ensembles, n_steps, n_walkers, _ = kept.shape

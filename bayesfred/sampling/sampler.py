@@ -43,7 +43,7 @@ from bayesfred.sampling.stopping import (
     sufficient,
 )
 
-__all__ = ["Run", "check_estimate", "check_output", "sample", "versions"]
+__all__ = ["Run", "check_density", "check_estimate", "check_output", "sample", "versions"]
 
 PACKAGES = ("bayesfred", "emcee", "numba", "numpy", "scipy")
 
@@ -163,6 +163,7 @@ def sample(
                     )
                 _check_same(path, fingerprint(chain.posterior()), parts)
                 _check_same_draws(path, chain, seed, ensembles, walkers)
+                check_density(posterior, chain.estimate)
                 run = Run.resumed(posterior, replace(chain, record=record or chain.record))
             else:
                 run = fresh()
@@ -189,17 +190,21 @@ def check_output(path: Path, posterior: TargetDensity) -> dict[str, str]:
 
 
 def check_estimate(posterior: TargetDensity, estimate: MapEstimate) -> None:
-    """Refuse the maximum of a posterior with other parameters, or of another one."""
+    """Refuse the maximum of a posterior with other parameters."""
     expected = len(posterior.parameter_names)
     if np.shape(estimate.params) != (expected,):
         raise InputError(
             f"estimate: got {np.size(estimate.params)} parameters, expected {expected}: find "
             "this posterior's maximum"
         )
+
+
+def check_density(posterior: TargetDensity, estimate: MapEstimate) -> None:
+    """Refuse what is no maximum: a file may hold anything."""
     if not np.isfinite(posterior.log_prob(estimate.params)):
         raise InputError(
-            "estimate: got parameters without posterior density, expected a maximum: find this "
-            "posterior's maximum"
+            "estimate: got parameters without posterior density, expected a maximum: restore a "
+            "copy, or run again"
         )
 
 
