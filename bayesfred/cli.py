@@ -8,16 +8,13 @@ terminated with everything saved.
 from enum import StrEnum
 from importlib import metadata, resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import bayesfred as bf
 from bayesfred.errors import InputError
 from bayesfred.terminal import run, say_to
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer(
     help="Posterior of an imaging system's field distortion, from a frame of photon counts.",

@@ -740,6 +740,16 @@ def test_an_estimate_that_no_run_can_start_from_is_refused(
     assert not (tmp_path / "chain.h5").exists()
 
 
+def test_a_covariance_that_was_rounded_is_read(whole: Chain, tmp_path: Path) -> None:
+    """What a user's own search gave must not make a finished run unreadable."""
+    path, covariance = tmp_path / "chain.h5", whole.estimate.covariance
+    rounding = np.random.default_rng(5).uniform(-1e-9, 1e-9, covariance.shape)
+    rounded = covariance * (1.0 + rounding)
+    assert not np.array_equal(rounded, rounded.T)
+    write_chain(replace(whole, path=path, estimate=replace(whole.estimate, covariance=rounded)))
+    assert np.array_equal(open_chain(path).estimate.covariance, rounded)
+
+
 def spoil_last_step(whole: Chain, path: Path, name: str, values: Floats) -> None:
     """A chain file whose last step has other walkers."""
     array = getattr(whole, name).copy()

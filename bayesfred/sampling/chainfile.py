@@ -32,6 +32,7 @@ from bayesfred.sampling.chain import Chain, Method
 from bayesfred.sampling.record import RunRecord
 
 LARGEST = 1e100  # of a parameter, and of its inverse: their squares are numbers too
+ROUNDING = 1e-6  # of a correlation
 
 
 def open_chain(path: PathLike) -> Chain:
@@ -249,13 +250,10 @@ def _read(path: Path, file: h5py.File) -> Chain:
     wrong = [name for name, (array, right) in expected.items() if array.shape != right]
     if wrong or 0 in shape:
         raise ValueError(f"shapes that do not agree: {', '.join(wrong)}")
-    low, high = chain.density.support
     for params in (chain.chain, chain.estimate.params):
         size = np.abs(params)
         if not np.all((size == 0.0) | ((size >= 1.0 / LARGEST) & (size <= LARGEST))):
             raise ValueError("draws or a maximum that are no numbers, or out of all proportion")
-        if not np.all((low <= params) & (params <= high)):
-            raise ValueError("draws or a maximum outside the support")
     if not _is_covariance(chain.estimate.covariance):
         raise ValueError("a covariance that is none")
     if chain.seed < 0:
@@ -280,12 +278,15 @@ def _accepted(stored: Floats, group: Any) -> Ints:
 
 
 def _is_covariance(matrix: Floats) -> bool:
-    """Whether a matrix is symmetric and positive definite."""
+    """Whether a matrix is symmetric, but for rounding, and positive definite."""
     sd = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    if not (np.all((sd > 0.0) & (sd <= LARGEST)) and np.array_equal(matrix, matrix.T)):
+    if not np.all((sd > 0.0) & (sd <= LARGEST)):
+        return False
+    correlation = matrix / np.outer(sd, sd)
+    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=ROUNDING):
         return False
     try:
-        np.linalg.cholesky(matrix / np.outer(sd, sd))
+        np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
         return False
     return True
