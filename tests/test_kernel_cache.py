@@ -16,7 +16,7 @@ import bayesfred
 # A kernel that calls functions of other modules: one with the polynomials, and a PSF's. That PSF
 # is given inside a tuple, as the package's own kernels get it.
 KERNEL = """
-from bayesfred.imaging.kernels.compilation import entry
+from bayesfred.imaging.kernels.compilation import entry, shared
 from bayesfred.imaging.kernels.polynomials import evaluate
 from bayesfred.imaging.kernels.psf_dispatch import psf_slopes
 
@@ -27,6 +27,14 @@ def linear(c, u, v):
 @entry()
 def value(parts):
     return parts[1] * psf_slopes(parts[0], 0.0, 0.0)[0]
+
+@shared()
+def twice(x):
+    return 2.0 * x
+
+@entry()
+def four_times(x):
+    return 2.0 * twice(x)
 """
 
 BEGIN = """
@@ -35,7 +43,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from bayesfred.imaging.kernels import compilation
 if "numba alone" in sys.argv:
-    compilation._Cache = compilation.FunctionCache
+    compilation._Cache = lambda function, is_shared: compilation.FunctionCache(function)
+if "not asked" in sys.argv:
+    compilation._Call.is_there = lambda call: True
 from bayesfred.imaging.kernels.caller import linear, value
 """
 POLYNOMIAL = (
@@ -144,3 +154,40 @@ def test_of_processes_that_need_a_function_one_compiles_it(
         (package.parent / "go").touch()
         assert sum(count.result() for count in counts) == (2.0 if arguments else 1.0)
     assert not list(package.rglob("*.lock"))
+
+
+SHARED = BEGIN + "from bayesfred.imaging.kernels.caller import four_times; print(four_times(3.0))"
+
+
+@pytest.mark.parametrize("arguments", [(), ("not asked",)])
+def test_a_function_whose_callee_was_compiled_anew_is_too(
+    package: Path, arguments: tuple[str, ...]
+) -> None:
+    """A caller holds the name of a shared function's machine code, which another process may give
+    another name.
+
+    Negative control: if the names are not compared, the name that is missing ends the process.
+    """
+    assert printed(package, SHARED) == 12.0
+    for file in package.rglob("caller.twice*"):
+        file.unlink()
+    # the number of functions that were compiled before is part of a name
+    program = "import numba; numba.njit(lambda x: x)(1.0)\n" + SHARED
+    if arguments:
+        with pytest.raises(subprocess.CalledProcessError):
+            printed(package, program, *arguments)
+    else:
+        assert printed(package, program) == 12.0
+
+
+@pytest.mark.parametrize("arguments", [(), ("numba alone",)])
+def test_a_shared_function_is_no_part_of_its_callers(
+    package: Path, arguments: tuple[str, ...]
+) -> None:
+    """Negative control: with numba's own cache the caller's code contains it."""
+    ask = BEGIN + (
+        "from bayesfred.imaging.kernels.caller import four_times; four_times(3.0); "
+        "code = four_times.overloads[four_times.signatures[0]].library.get_llvm_str(); "
+        "print(sum('declare' in line and 'twice' in line for line in code.splitlines()))"
+    )
+    assert printed(package, ask, *arguments) == (0.0 if arguments else 1.0)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, inner, shared
 from bayesfred.imaging.kernels.contexts import (
     LANES,
     Footprints,
@@ -43,7 +43,7 @@ class _Search(NamedTuple):
     stack: Floats  # parts of the frame
 
 
-@inner()
+@shared()
 def new_geometry(o):
     """Room for the geometry of all sources."""
     size = o.x.size
@@ -224,7 +224,7 @@ def _survey(o, source, search):
     return largest
 
 
-@inner()
+@shared()
 def locate(o, theta, nuisances, geometry):
     """Fill `geometry`; False where the distortion is not admissible.
 
@@ -269,7 +269,7 @@ def locate(o, theta, nuisances, geometry):
     return unfolded
 
 
-@inner()
+@shared()
 def move(o, geometry, s, by_x, by_y):
     """Shift source s along a and b."""
     a, b = geometry.a[s], geometry.b[s]
@@ -278,7 +278,7 @@ def move(o, geometry, s, by_x, by_y):
     multiply(a, b, len(o.degrees.d) > 0, geometry.q[s], geometry.d[s])
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@shared(fastmath=FAST, error_model="numpy")
 def find_footprints(o, geometry):
     """The rows of pixels that every source reaches, their lengths multiples of LANES."""
     sources, size = geometry.peak.shape[0], 0

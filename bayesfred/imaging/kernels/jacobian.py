@@ -7,11 +7,10 @@ source's pixels without making them.
 
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, inner, shared
 from bayesfred.imaging.kernels.contexts import Degrees, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import (
@@ -119,7 +118,7 @@ def widens(basis):
     return size > 0 and basis.row[-1] == basis.f.shape[0] + basis.g.shape[0] + 1
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _polynomial_row(out, line, coefficients, degree):
     """out[i] = a polynomial of t."""
     top, ramp, t0 = len(degree), line.ramp, line.t0
@@ -131,7 +130,7 @@ def _polynomial_row(out, line, coefficients, degree):
         out[i] = p
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _times_polynomial(out, source, factor, line, coefficients, degree):
     """out[i] = factor times source[i] times a polynomial of t."""
     top, ramp, t0 = len(degree), line.ramp, line.t0
@@ -143,7 +142,7 @@ def _times_polynomial(out, source, factor, line, coefficients, degree):
         out[i] = p * factor * source[i]
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _slopes_row(psf, inverse, weight, p, a, b):
     """From a and b to weight times p, p_a and p_b."""
     slope = -weight * inverse
@@ -152,7 +151,7 @@ def _slopes_row(psf, inverse, weight, p, a, b):
         p[i], a[i], b[i] = weight * k, slope * x, slope * y
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _second_derivatives_row(psf, inverse, weight, along_a, samples):
     """The same for -p_a, or for -p_b, in place of p."""
     p, a, b = samples.p, samples.along_a, samples.along_b
@@ -163,7 +162,7 @@ def _second_derivatives_row(psf, inverse, weight, along_a, samples):
         a[i], b[i] = second * (xx if along_a else xy), second * (xy if along_a else yy)
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _times_determinant(p, size, signed):
     """From D in `signed` to size = p |D| and p sign(D)."""
     for i in range(p.size):
@@ -171,7 +170,7 @@ def _times_determinant(p, size, signed):
         signed[i] = p[i] if signed[i] > 0.0 else -p[i]
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _times_absolute(a, b, d):
     for i in range(d.size):
         a[i] *= abs(d[i])
@@ -200,7 +199,7 @@ def samples_row(sampler, weight, template, line, samples):
     _times_determinant(samples.p, samples.size, samples.signed)
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _add_widening(out, order, samples, sampler, line):
     """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma.
 
@@ -219,13 +218,13 @@ def _add_widening(out, order, samples, sampler, line):
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) * inverse
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _add_row_of(out, row):
     for i in range(row.size):
         out[i] += row[i]
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _powers_row(powers, ramp, u0, n):
     """powers[m] = u^m at u = u0 + ramp[i]."""
     powers[0, :n] = 1.0
@@ -235,7 +234,7 @@ def _powers_row(powers, ramp, u0, n):
             row[i] = before[i] * (u0 + ramp[i])
 
 
-@nb.njit(inline="always")
+@inner(fastmath=FAST, error_model="numpy")
 def _add_monomials(basis_powers, v, terms, powers, out, start):
     """Add B along + B_u first + B_v second to the rows of the basis from `start` on.
 
@@ -257,7 +256,7 @@ def _add_monomials(basis_powers, v, terms, powers, out, start):
                 row[i] += bx * lower[i] * first[i]
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@shared(fastmath=FAST, error_model="numpy")
 def basis_row(rows, source, u_row, v_row, n, template):
     """Fill rows.out with the basis of a unit source in n pixels from (u_row, v_row) on.
 
@@ -305,7 +304,7 @@ def basis_row(rows, source, u_row, v_row, n, template):
             _add_monomials(g, v, (samples.along_b, g_u, g_v), powers, out, n_f)
 
 
-@inner(fastmath=FAST)
+@shared(fastmath=FAST)
 def add_jacobian_rows(layout, basis, flux, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
     rows, fp, grid = new_rows(layout, basis, out.shape[2]), layout.footprints, pixel_grid(layout)

@@ -4,7 +4,7 @@ On a row of pixels a^2 + b^2 and D are polynomials in u alone: a sample of a Gau
 two Horner sweeps and one exponential.
 """
 
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, shared
 from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import (
@@ -27,7 +27,7 @@ from bayesfred.imaging.kernels.psf_dispatch import (
 BATCH = 32
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@shared(fastmath=FAST, error_model="numpy")
 def add_source(layout, s, rows, flux, canvas, alone):
     """Add the rows of source s from rows[0] to rows[1], times its flux, to a canvas.
 
@@ -68,7 +68,7 @@ def add_source(layout, s, rows, flux, canvas, alone):
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@shared(fastmath=FAST, error_model="numpy")
 def add_templates(layout, s, flux, stamps, wider):
     """Add K, F X and F Y of source s to its rows of `stamps`, shape (3, samples).
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, shared
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import one_source
 from bayesfred.imaging.kernels.jacobian import (
@@ -163,7 +163,7 @@ def _sample_sums(layout, source, rows, template, weight, buffers):
     return flux
 
 
-@inner()
+@shared()
 def add_basis_sums(layout, basis, s, template, weight, buffers):
     """Add to buffers.out[k] the sum over a source's pixels of weight times row k of the basis."""
     sums, out, degrees = buffers.sums, buffers.out, layout.optics.degrees

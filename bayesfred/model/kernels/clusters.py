@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, shared
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.contexts import Clusters, Group
 
@@ -24,7 +24,7 @@ class Prior(NamedTuple):
     scatter: float  # tau; 0 where positions do not scatter
 
 
-@inner()
+@shared()
 def bounding_boxes(fp):
     """First row, last row + 1, first column, last column + 1 of every footprint."""
     size = fp.first.size - 1
@@ -55,7 +55,7 @@ def _group(keys, size):
     return order, first[:-1]
 
 
-@inner()
+@shared()
 def find_clusters(boxes, ny, templates):
     """Groups of sources connected by overlapping boxes: union-find along a sweep over the rows."""
     size = boxes.shape[0]
@@ -151,6 +151,13 @@ def dot(a, b, weight):
 
 
 @inner()
+def copy(values, out):
+    """Copy a row of numbers, which numba's own assignment would not compile in less than 4 s."""
+    for i in range(values.size):
+        out[i] = values[i]
+
+
+@inner()
 def _add_overlap(touching, s, t, weight, at, block):
     """block[m, n] += sum over the pixels that sources s and t share of weight T_sm T_tn."""
     fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
@@ -168,7 +175,7 @@ def _add_overlap(touching, s, t, weight, at, block):
                     block[m, n] += dot(left, stamps[n, qs + a : qs + b], part)
 
 
-@inner()
+@shared()
 def gram(touching, group, weight, at, out):
     """out[i, k] = sum over pixels of weight T_i T_k, the lower triangle.
 
@@ -200,7 +207,7 @@ def gram(touching, group, weight, at, out):
                 _add_overlap(touching, s, members[k], weight, at, block)
                 for m in range(size):
                     row = start[i * size + m] + k * size
-                    out[row : row + size] = block[m]
+                    copy(block[m], out[row : row + size])
 
 
 @inner()
@@ -218,7 +225,7 @@ def bend_prior(shift, scatter):
     return more + c * shift[0] ** 2, c * shift[0] * shift[1], more + c * shift[1] ** 2
 
 
-@inner()
+@shared()
 def add_prior(h, group, prior, fluxes, shifts, share):
     """Add the priors' curvature to H: a/F^2 for a flux, a share of k for a shift."""
     size = 3 if prior.scatter > 0.0 else 1
@@ -252,7 +259,7 @@ def _inner(a, b):
     return total
 
 
-@inner()
+@shared()
 def cholesky(h, group):
     """Lower triangle in place; False where the matrix is not positive definite."""
     lead, start = group.lead, group.start
@@ -270,7 +277,7 @@ def cholesky(h, group):
     return True
 
 
-@inner()
+@shared()
 def solve(lower, group, x):
     """x <- (L L^T)^-1 x, in place."""
     lead, start = group.lead, group.start

@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, shared
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.clusters import run_end, touch
 
@@ -189,7 +189,7 @@ def _both(touching, s, t):
     return touching.faint[s] and touching.faint[t] and touch(touching.boxes, s, t)
 
 
-@inner()
+@shared()
 def expand(touching, group, fluxes, shape, pixels):
     """The sum of c over the faint sources of a cluster, and its slopes."""
     members, size = group.members, touching.stamps.shape[0]
@@ -231,7 +231,7 @@ def related(one, other, mixed, shape):
     return mixed * mixed > OVERLAP * OVERLAP * (one + shape) * (other + shape)
 
 
-@inner()
+@shared()
 def add_slopes(touching, group, fluxes, pixels, slopes, out):
     """Add dc/dmu over C to an image, and dc/dT over W to an array of shape (samples,)."""
     h, light = out

@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, shared
 from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import move, row_starts
@@ -50,6 +50,7 @@ from bayesfred.model.kernels.clusters import (
     add_template,
     bend_prior,
     cholesky,
+    copy,
     gram,
     one_cluster,
     project,
@@ -107,7 +108,9 @@ def _start(cluster):
         below = squared(fp, s, stamps[0], patch.weight, canvas.at)
         scale = cluster.scale[s]
         fluxes[s] = max((above + 1.0 / scale) / (below + 0.5 / scale**2), 0.01 * scale)
-        stamps[1:, fp.start[fp.first[s]] : fp.start[fp.first[s + 1]]] *= fluxes[s]
+        for m in range(1, stamps.shape[0]):
+            for i in range(fp.start[fp.first[s]], fp.start[fp.first[s + 1]]):
+                stamps[m, i] *= fluxes[s]
         add_template(fp, s, stamps[0], fluxes[s], canvas)
 
 
@@ -158,12 +161,12 @@ def _subtract_second_derivatives(cluster, i, out):
 def _factor(cluster, h, lower):
     """Cholesky's factor of H, less the second derivatives where that is possible, in `lower`."""
     if cluster.touching.stamps.shape[0] > 1:
-        lower[:] = h
+        copy(h, lower)
         for i in range(cluster.group.members.size):
             _subtract_second_derivatives(cluster, i, lower)
         if cholesky(lower, cluster.group):
             return True
-        lower[:] = h  # far from the maximum
+        copy(h, lower)  # far from the maximum
     return cholesky(lower, cluster.group)
 
 
@@ -246,7 +249,7 @@ def _maximize(frame, parameters, cluster, h):
             return False
         if not exact:
             _secant(gradient, step, distances, shares, LONGEST if size == 1 else 1.0)
-        step[:] = gradient
+        copy(gradient, step)
         solve(lower, group, step)
         # The square of the distance in standard deviations, and what a step leaves of it: in a
         # Newton step of fluxes alone the square of the largest relative change.
@@ -264,7 +267,7 @@ def _maximize(frame, parameters, cluster, h):
     return False
 
 
-@inner(error_model="numpy")
+@shared(error_model="numpy")
 def profile(problem, layout, w, parameters, profiled, fluxes):
     """Fill the fluxes and `profiled` with their maximum; add the sources to the image.
 

@@ -165,23 +165,24 @@ def _second_derivatives(adjoint, group, i, part, g):
     out, grid, source = rows.out, adjoint.grid, one_source(adjoint.geometry, s)
     starts, lows, sizes, numbers = fp.start, fp.low, fp.size, fp.row
     flux, pitch = adjoint.fluxes[s], out.shape[1]
-    xx, xy, yy = np.empty(pitch), np.empty(pitch), np.empty(pitch)
+    xx, xy = np.empty(pitch), np.empty(pitch)
     for p in range(fp.first[s], fp.first[s + 1]):
         n = sizes[p]
         u, v = (lows[p] - grid.middle_u) * grid.step, (numbers[p] - grid.middle_v) * grid.step
         basis_row(rows, source, u, v, n, np.int64(1))
-        xx[:n], xy[:n] = -flux * out[0, :n], -flux * out[1, :n]
-        basis_row(rows, source, u, v, n, np.int64(2))
-        yy[:n] = -flux * out[1, :n]
         for k in range(n):
+            xx[k], xy[k] = -flux * out[0, k], -flux * out[1, k]
+        basis_row(rows, source, u, v, n, np.int64(2))
+        for k in range(n):
+            yy = -flux * out[1, k]
             at, pixel = starts[p] + k, ats[p] + k
             x, y = stamps[1, at] / flux, stamps[2, at] / flux
             r, weight = score[pixel], weights[pixel]
             q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
             part[0] -= weight * (q1 * x + q2 * y)
             part[1] -= weight * (q0 * x + q1 * xx[k] + q2 * xy[k])
-            part[2] -= weight * (q0 * y + q1 * xy[k] + q2 * yy[k])
-            add_block(i, group.start, g, (-r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy[k]))
+            part[2] -= weight * (q0 * y + q1 * xy[k] + q2 * yy)
+            add_block(i, group.start, g, (-r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy))
 
 
 @inner()

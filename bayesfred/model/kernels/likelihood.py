@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, inner, shared
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
@@ -63,7 +63,7 @@ def room(w, first, size):
     return w.heap[first : first + size] if first + size <= w.heap.size else np.empty(size)
 
 
-@inner()
+@shared()
 def mark(frame, fp, w):
     """Mark the segments that are visited: those that a source reaches, or all that count."""
     _mark_sources(fp, w)
@@ -184,7 +184,7 @@ def _weigh_rows(frame, noise, w, background, rows, ratios):
             start, stop = next_run(w, j, stop)
 
 
-@inner()
+@shared()
 def weigh_rows(frame, noise, w, background, rows, ratios):
     """Score and weight of the marked pixels of rows (first, last + 1), and their ratios if wanted.
 
@@ -204,7 +204,7 @@ def _slope_run(part, out):
         out[i] = part.image[i] + x * (part.c1 + x * part.c2)
 
 
-@inner()
+@shared()
 def unreached_pixels(frame, w):
     """The pixels that no source reaches."""
     per_row = w.flags.size // frame.ny
@@ -217,7 +217,7 @@ def unreached_pixels(frame, w):
     return Unreached(pixels, counts, w.flags)
 
 
-@inner()
+@shared()
 def log_likelihood(frame, w, parameters):
     """Log-likelihood of the workspace's image plus the background.
 

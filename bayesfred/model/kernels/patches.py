@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, shared
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.model.kernels.contexts import LIMIT
 from bayesfred.model.kernels.likelihood import room, stretch, weigh_run
@@ -23,7 +23,7 @@ class Patch(NamedTuple):
     ratio: Floats
 
 
-@inner()
+@shared()
 def new_patch(w, touching, group, at):
     """A cluster's pixels without sources; where its footprints' rows begin goes into `at`."""
     fp, boxes, members = touching.footprints, touching.boxes, group.members
@@ -53,7 +53,7 @@ def new_patch(w, touching, group, at):
     return Patch(top, low, start, image, w.score[:size], w.weight[:size], w.ratio[:size])
 
 
-@inner()
+@shared()
 def weigh_patch(frame, noise, background, patch, ratios):
     """Score and weight of a patch's pixels; their ratios into `ratios` unless it is None."""
     for j in range(patch.first.size):

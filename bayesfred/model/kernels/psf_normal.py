@@ -212,6 +212,14 @@ def _add_line(factor, line, target):
 
 
 @inner()
+def _add_squares(lines, matrix):
+    """Add half the products of lines with themselves."""
+    products = np.dot(lines.T, lines)
+    for i in range(products.shape[0]):
+        _add_line(0.5, products[i], matrix[i])
+
+
+@inner()
 def _add_wings(levels, samples, flux, i, out):
     """Add the B-splines of pixel i in the level of wings, times the light; all knots' values."""
     level = _wide(levels)
@@ -256,10 +264,8 @@ def _add_variation(levels, field, samples, flux, weight, matrix):
                 _add_gram(samples, n, (side, h), weight[owner[n]] * light**2, grams[m])
                 if wings == 0:
                     continue
-                i, j = (
-                    _splines(samples.a[n] / h, side, wx, spare),
-                    _splines(samples.b[n] / h, side, wy, spare),
-                )
+                i = _splines(samples.a[n] / h, side, wx, spare)
+                j = _splines(samples.b[n] / h, side, wy, spare)
                 if i <= -4 or j <= -4 or i >= side or j >= side:
                     continue
                 line[:] = 0.0
@@ -269,7 +275,8 @@ def _add_variation(levels, field, samples, flux, weight, matrix):
                         share = weight[owner[n]] * light * wx[p] * wy[q]
                         _add_line(share, line, crosses[m, (j + q) * side + i + p])
             for t in range(terms):
-                products[m, t * terms : (t + 1) * terms] = field[s, low + t] * field[s, low:high]
+                for o in range(terms):
+                    products[m, t * terms + o] = field[s, low + t] * field[s, low + o]
         total += np.dot(grams.reshape(TOGETHER, -1)[:some].T, products[:some])
         own = np.ascontiguousarray(field[begin : begin + some, low:high].T)
         if wings > 0:
@@ -281,10 +288,11 @@ def _add_variation(levels, field, samples, flux, weight, matrix):
                 row, column = start + knot * terms, start + (j * side + i) * terms
                 both = total[knot * 4 * NEAR + o]
                 for t in range(terms):
-                    matrix[row + t, column : column + terms] += both[t * terms : (t + 1) * terms]
+                    squares = both[t * terms : (t + 1) * terms]
+                    _add_line(1.0, squares, matrix[row + t, column : column + terms])
         for t in range(terms):
             own = wide[t, knot * wings : (knot + 1) * wings]
-            matrix[start + knot * terms + t, matrix.shape[0] - wings :] += own
+            _add_line(1.0, own, matrix[start + knot * terms + t, matrix.shape[0] - wings :])
 
 
 @inner()
@@ -366,9 +374,9 @@ def psf_information(levels, field, samples, pixels, templates):
             line *= math.sqrt(w)
             filled += 1
             if filled == LINES:
-                matrix[begin:, begin:] += 0.5 * np.dot(lines.T, lines)
+                _add_squares(lines, matrix[begin:, begin:])
                 filled = 0
-    matrix[begin:, begin:] += 0.5 * np.dot(lines[:filled].T, lines[:filled])
+    _add_squares(lines[:filled], matrix[begin:, begin:])
     if levels.high[-1 if wide > last else -2] > 1:
         _add_variation(levels, field, samples, flux, weight, matrix)
     return matrix, coupling, others

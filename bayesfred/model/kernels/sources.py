@@ -230,14 +230,16 @@ def _fill_equations(own, weight, members, sums, equations):
     matrix, vector, scale = equations
     block = np.empty((TEMPLATES, TEMPLATES))
     for i in range(members.size):
-        rows = slice(i * TEMPLATES, (i + 1) * TEMPLATES)
+        s = members[i]
         for k in range(i + 1):
-            if i == k:
-                block[:] = squares[members[i]]
-            else:
-                _overlap(own, weight, members[i], members[k], block)
-            matrix[rows, k * TEMPLATES : (k + 1) * TEMPLATES] = block
-        vector[rows] = projected[members[i]]
+            if k < i:
+                _overlap(own, weight, s, members[k], block)
+            part = block if k < i else squares[s]
+            for m in range(TEMPLATES):
+                for n in range(TEMPLATES):
+                    matrix[i * TEMPLATES + m, k * TEMPLATES + n] = part[m, n]
+        for m in range(TEMPLATES):
+            vector[i * TEMPLATES + m] = projected[s, m]
     for i in range(vector.size):
         scale[i] = 1.0 / np.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else 0.0
         vector[i] *= scale[i]
