@@ -130,10 +130,19 @@ import time
 from pathlib import Path
 import numpy as np
 from numba.core import event
+class Slow(event.Listener):  # so that a busy machine starts both before one ends
+    def on_start(self, event):
+        time.sleep(3.0)
+    def on_end(self, event):
+        pass
+
 Path("ready" + sys.argv[1]).touch()
 while not Path("go").exists():
     time.sleep(0.001)
-with event.install_recorder("numba:compile") as compiled:
+with (
+    event.install_recorder("numba:compile") as compiled,
+    event.install_listener("numba:compile", Slow()),
+):
     assert linear(np.array([[3.0, 2.0], [1.0, 0.0]]), 4.0, 5.0) == 17.0
 names = [each.data["dispatcher"].py_func.__name__ for _, each in compiled.buffer if each.is_end]
 print(names.count("linear"))

@@ -174,8 +174,7 @@ def _second_derivatives(adjoint, group, i, part, g):
             xx[k], xy[k] = -flux * out[0, k], -flux * out[1, k]
         basis_row(rows, source, u, v, n, np.int64(2))
         for k in range(n):
-            yy = -flux * out[1, k]
-            at, pixel = starts[p] + k, ats[p] + k
+            at, pixel, yy = starts[p] + k, ats[p] + k, -flux * out[1, k]
             x, y = stamps[1, at] / flux, stamps[2, at] / flux
             r, weight = score[pixel], weights[pixel]
             q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
