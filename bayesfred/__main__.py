@@ -4,6 +4,7 @@ It may come while modules are imported, which takes seconds the first time, and 
 Python's own that let no exception through.
 """
 
+import gc
 import signal
 import sys
 from _thread import interrupt_main
@@ -26,6 +27,7 @@ def main() -> None:
     ]
     for number in handled:
         signal.signal(number, _end)
+    gc.disable()  # until all is imported: nothing of it is garbage
     try:
         from bayesfred.cli import app  # noqa: PLC0415 - where Ctrl-C is known already
 

@@ -1,5 +1,6 @@
 """A command's work in a terminal: what is asked for first, signals, exit codes."""
 
+import gc
 import io
 import signal
 import sys
@@ -39,6 +40,8 @@ def run(work: Callable[[], bool], *files: Path) -> None:
 
         with working("loading"):
             _ = bf.commands, bf.show
+        gc.freeze()  # what is imported is never looked through again
+        gc.enable()
         well = work()
     except InputError as error:
         typer.echo(f"bayesfred: {error}", err=True)
