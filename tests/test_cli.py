@@ -124,13 +124,18 @@ def z_scores(chain: Chain, truth: dict[str, float]) -> dict[str, float]:
     return dict(zip(chain.parameter_names, z.tolist(), strict=True))
 
 
+def without_waits(text: str) -> str:
+    """Standard error without what a slow machine is told every half minute."""
+    return re.sub(r"^[^\n]+: \d+ s\r?\n", "", text, flags=re.MULTILINE)
+
+
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a run file, and the frame and catalogue that `simulate` made of it."""
     folder = tmp_path_factory.mktemp("simulated")
     (folder / "run.toml").write_text(run_text(), encoding="utf-8")
     output = invoke(folder, "simulate", "run.toml")
-    assert (output.code, output.stderr) == (0, "")
+    assert (output.code, without_waits(output.stderr)) == (0, "")
     assert "stars.csv: 9 sources" in output.stdout
     assert re.search(r"frame\.fits: \d+ x \d+ pixels, \d+ counts", output.stdout)
     assert sorted(path.name for path in folder.iterdir()) == ["frame.fits", "run.toml", "stars.csv"]

@@ -8,6 +8,8 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,11 +26,12 @@ from test_cli import (
     invoke,
     run_text,
     simulated,
+    without_waits,
 )
 
 from bayesfred.io.summary_table import make_table
 from bayesfred.reporting.screen import comparison_table, parameter_table
-from bayesfred.sampling.progress import progress_bar
+from bayesfred.sampling.progress import progress_bar, working
 
 __all__ = ["finished", "folder", "simulated"]  # fixtures
 
@@ -102,7 +105,7 @@ def test_plain_terminals_get_plain_text(folder: Path) -> None:
         assert code == 3 and "not trustworthy: " in shown
         assert (ESCAPE not in shown) == (ESCAPE not in errors) == plain, extra
         if plain:
-            assert errors == ""
+            assert without_waits(errors) == ""
         else:
             assert "12 steps" in errors
 
@@ -124,7 +127,7 @@ def test_a_pipe_gets_80_columns_without_escape_codes(
     done = subprocess.run(
         command("report", "kamera-ü.h5"), cwd=tmp_path, env=env, capture_output=True, check=False
     )
-    assert (done.returncode, done.stderr) == (0, b"")
+    assert (done.returncode, without_waits(done.stderr.decode())) == (0, "")
     shown = done.stdout.decode("ascii" if ascii else "utf-8")
     assert ESCAPE not in shown
     assert max(map(len, table_lines(shown))) <= width
@@ -205,7 +208,7 @@ def test_json_is_one_object_and_all_else_is_on_standard_error(
     shutil.copy(finished[0] / "run.h5", folder / "other.h5")
     said = invoke(folder, "report", "other.h5", "--json")
     found = json.loads(said.stdout, parse_constant=pytest.fail)
-    assert said.code == 0 and said.stdout.count("\n") == 1 and said.stderr == ""
+    assert said.code == 0 and said.stdout.count("\n") == 1 and without_waits(said.stderr) == ""
     assert found["sampled_well"] is found["fits_data"] is found["trustworthy"] is True
     assert found["message"].startswith("trustworthy: ")
     assert [parameter["name"] for parameter in found["parameters"]] == list(NAMES)
@@ -256,6 +259,25 @@ def test_where_nothing_can_be_redrawn_a_line_comes_every_half_minute(terminal: b
         assert re.fullmatch(r"(sampling: \d steps, \d0%\n){3,4}", text)
 
 
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("show", [False, True])
+def test_long_work_is_never_silent(terminal: bool, show: bool) -> None:
+    """Negative control: where nothing is to be shown there is nothing."""
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=terminal, force_jupyter=False, _environ={})
+    with working("thinking", show=show, console=console, interval=0.05):
+        time.sleep(0.5)
+    text = stream.getvalue()
+    if not show:
+        assert text == ""
+    elif terminal:
+        assert ESCAPE in text and "thinking" in text and "0:00:00" in text
+    else:
+        assert re.fullmatch(r"(thinking: \d s\n){2,10}", text)
+        assert without_waits(text) == ""
+    assert "bayesfred-wait" not in [thread.name for thread in threading.enumerate()]
+
+
 def test_a_notebook_gets_no_widgets_and_no_warnings(folder: Path) -> None:
     """As in a Jupyter kernel, where rich finds this shell and would show widgets."""
     code = """
@@ -275,7 +297,7 @@ def test_a_notebook_gets_no_widgets_and_no_warnings(folder: Path) -> None:
         [sys.executable, "-c", script], cwd=folder, env=environment(), capture_output=True,
         check=False, text=True,
     )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, without_waits(done.stderr)) == (0, "")
     assert "not trustworthy: " in done.stdout.splitlines()[-1]
     # the negative control: rich's own display in such a shell warns
     control = """

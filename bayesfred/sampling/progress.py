@@ -6,11 +6,18 @@ a run of more than half a minute prints a line every half minute, a shorter one 
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
+from contextlib import contextmanager
+from threading import Event, Thread
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 __all__ = ["progress_bar", "working"]
 
@@ -19,17 +26,49 @@ SEARCHING = "searching for the maximum (the first run on a machine compiles: hal
 INTERVAL = 30.0  # seconds between lines
 
 
-def working(what: str = SEARCHING, *, show: bool = True) -> AbstractContextManager[Any]:
-    """Says in a terminal, within its `with` block, what is being done.
+@contextmanager
+def working(
+    what: str = SEARCHING,
+    *,
+    show: bool = True,
+    console: Console | None = None,
+    interval: float = INTERVAL,
+) -> Iterator[None]:
+    """Says, within its `with` block, what is being done, and for how long.
 
     Parameters
     ----------
     what : str
     show : bool
         Whether anything is shown at all.
+    console : Console, optional
+        Where it is shown; by default on standard error.
+    interval : float, seconds
+        Between the lines that are printed where nothing is redrawn.
     """
-    console = _standard_error()
-    return console.status(what) if show and _live(console) else nullcontext()
+    console = console or _standard_error()
+    if show and _live(console):
+        columns = (SpinnerColumn(), TextColumn(what), TimeElapsedColumn())
+        with Progress(*columns, console=console, transient=True) as display:
+            display.add_task("", total=None)
+            yield
+    elif show:
+        begun, ended = time.monotonic(), Event()
+
+        def tell() -> None:
+            while not ended.wait(interval):
+                line = f"{what}: {time.monotonic() - begun:.0f} s"
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+        teller = Thread(target=tell, name="bayesfred-wait", daemon=True)
+        teller.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            teller.join()
+    else:
+        yield
 
 
 @contextmanager
