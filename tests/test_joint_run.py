@@ -275,6 +275,7 @@ def test_resumed_steps_are_those_of_a_longer_run(folder: Path) -> None:
     assert record.notes[0].startswith("a: a.npy: 65 x 65 pixels")
 
 
+@pytest.mark.long
 def test_workers_make_the_same_chain_and_are_gone_afterwards(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

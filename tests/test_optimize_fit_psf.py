@@ -219,6 +219,7 @@ def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
         assert off[0] < 0.03 and off[1] > 2.0 * off[0], off
 
 
+@pytest.mark.long
 def test_errors_of_the_psf_are_those_of_a_joint_fit():
     """The former come from gradients at drawn PSFs, the joint fit from one matrix."""
     _, _, posterior = frame_of(bf.MoffatPSF(1.2, 4.765), 1.2, side=4)

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from test_any_chain import RESUMED
 from test_any_input import STARS, sound_counts
 from test_cli import environment
@@ -41,6 +42,7 @@ path = "study.ecsv"
 """
 
 
+@pytest.mark.long
 def test_a_fit_a_report_and_a_study(tmp_path: Path) -> None:
     np.save(tmp_path / "frame.npy", sound_counts())
     (tmp_path / "stars.csv").write_text("".join(",".join(row) + "\n" for row in STARS))
