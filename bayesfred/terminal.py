@@ -40,8 +40,9 @@ def run(work: Callable[[], bool], *files: Path) -> None:
 
         with working("loading"):
             _ = bf.commands, bf.show
-        gc.freeze()  # what is imported is never looked through again
-        gc.enable()
+        if not gc.isenabled():  # it rests from the program's first line on
+            gc.freeze()  # what is imported is never looked through again
+            gc.enable()
         well = work()
     except InputError as error:
         typer.echo(f"bayesfred: {error}", err=True)

@@ -282,7 +282,7 @@ def test_a_notebook_gets_no_widgets_and_no_warnings(folder: Path) -> None:
     """As in a Jupyter kernel, where rich finds this shell and would show widgets."""
     code = """
         import builtins, warnings
-        ZMQInteractiveShell = type("ZMQInteractiveShell", (), {})
+        ZMQInteractiveShell = type("ZMQInteractiveShell", (), {"custom_exceptions": ()})
         builtins.get_ipython = ZMQInteractiveShell
         warnings.simplefilter("error")
         import bayesfred as bf, rich.console

@@ -13,6 +13,7 @@ from scipy import stats
 import bayesfred as bf
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.frame_agreement import frame_agreement
+from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
 from bayesfred.sampling.frame_moves import FrameMove
 
@@ -92,6 +93,16 @@ def test_log_prob_is_the_prior_times_every_frames_likelihood(
     outside = vectors[0].copy()
     outside[joint.parameter_names.index("b.background")] = -1.0
     assert joint.log_prob(outside) == -np.inf
+
+
+@pytest.mark.parametrize("method", ["gradient", "fisher", "information", "prior_gradient"])
+def test_several_vectors_are_refused_where_one_is_answered(
+    frames: dict[str, bf.Posterior], estimate: bf.MapEstimate, method: str
+) -> None:
+    joint, several = bf.JointPosterior(frames), np.stack([estimate.params, estimate.params])
+    assert joint.log_prob(several).shape == joint.log_prior(several).shape == (2,)
+    with pytest.raises(InputError, match="expected one vector of shape"):
+        getattr(joint, method)(several)
 
 
 @pytest.mark.parametrize("walk", [None, 0.2])

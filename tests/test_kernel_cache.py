@@ -169,7 +169,7 @@ SHARED = BEGIN + "from bayesfred.imaging.kernels.caller import four_times; print
 
 
 @pytest.mark.parametrize("arguments", [(), ("not asked",)])
-def test_a_function_whose_callee_was_compiled_anew_is_too(
+def test_a_function_whose_callee_was_compiled_again_is_too(
     package: Path, arguments: tuple[str, ...]
 ) -> None:
     """A caller holds the name of a shared function's machine code, which another process may give

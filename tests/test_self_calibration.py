@@ -192,6 +192,15 @@ def test_likelihood_with_moved_sources_is_that_of_a_new_frame(small) -> None:
         )
 
 
+@pytest.mark.parametrize("method", ["gradient", "fisher", "information", "prior_information"])
+def test_several_vectors_are_refused_where_one_is_answered(small, method: str) -> None:
+    posterior, params = small
+    several = np.stack([params, params])
+    assert posterior.log_prior(several).shape == (2,)
+    with pytest.raises(InputError, match="expected one vector of shape"):
+        getattr(posterior, method)(several)
+
+
 def test_log_prob_is_a_sum_over_frames_and_priors(small) -> None:
     posterior, params = small
     total = float(posterior.log_prior(params)[0])

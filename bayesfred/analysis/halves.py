@@ -32,7 +32,6 @@ from bayesfred.analysis.joint_folds import (
 )
 from bayesfred.analysis.sources import source_table
 from bayesfred.errors import InputError
-from bayesfred.model.joint import JointPosterior
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
@@ -118,10 +117,7 @@ def fit_half(posterior: AnyPosterior, folds: FrameFolds, fold: int, start: Float
             "terms, or use more sources"
         )
     information = half.fisher(top.params)
-    if isinstance(half, JointPosterior):
-        pull = half.gradient(top.params) - half.prior_gradient(top.params)
-    else:
-        pull = half.likelihood.gradient(top.params)
+    pull = half.gradient(top.params) - half.prior_gradient(top.params)
     return Half(top.params, information, information @ (top.params - start) + pull)
 
 
@@ -161,7 +157,7 @@ def difference(
         What one standard deviation along each is of the m parameters.
     """
     free = ~columns_of(posterior, are_scales)
-    prior = _prior_information(posterior, start)
+    prior = posterior.prior_information(start)
     scale = 1.0 / np.sqrt(np.diag(sum((half.information for half in halves), prior)))[free]
     prior, one, two = (
         matrix[np.ix_(free, free)] * np.outer(scale, scale)
@@ -244,7 +240,7 @@ def predicted(
     """
     half, wanted = folds.only(posterior, fold), coefficients(posterior)
     free = ~columns_of(posterior, are_scales)
-    information = other.information + _prior_information(half, other.params)
+    information = other.information + half.prior_information(other.params)
     covariance = inverse(information[np.ix_(free, free)])[np.ix_(wanted[free], wanted[free])]
     total, each = _Sums.zero(len(covariance)), {}
     for view in frame_views(half):
@@ -310,12 +306,6 @@ def _displacements(products: Floats, z: Floats) -> Displacements:
         math.sqrt(max(float(z @ products @ z), 0.0)),
         math.sqrt(float(np.sum(values))),
     )
-
-
-def _prior_information(posterior: AnyPosterior, params: Floats) -> Floats:
-    if isinstance(posterior, JointPosterior):
-        return np.diag(posterior.prior_curvature(params))
-    return posterior.prior_information(params)
 
 
 def _are_coefficients(frame: Posterior) -> Flags:

@@ -28,7 +28,7 @@ Positions, turns and pointings without such a prior have flat priors, which do n
 import itertools
 import queue
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -41,15 +41,15 @@ from bayesfred.errors import InputError
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.dither_layout import DitherLayout, check_frames, rotation
+from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.movable import Matrix, MovableLikelihood
 from bayesfred.model.posterior import Posterior
-from bayesfred.model.protocol import TargetDensity
 from bayesfred.model.threads import share
 
 
 @serializable("dithered_posterior")
 @dataclass(frozen=True, eq=False, init=False)
-class DitheredPosterior(TargetDensity):
+class DitheredPosterior(FrameDensity):
     """Posterior of distortion, pointings and source positions given dithered frames.
 
     `self_calibrate` makes it from counts alone.
@@ -118,7 +118,7 @@ class DitheredPosterior(TargetDensity):
         prior: Mapping[str, Any] | None = None,
     ) -> None:
         check_frames(frames, members, pointings)
-        values: tuple[Any, ...] = (
+        self._set_fields(
             dict(frames),
             {name: np.array(members[name], dtype=np.int64) for name in frames},
             {name: tuple(float(value) for value in pointings[name]) for name in frames},
@@ -127,8 +127,6 @@ class DitheredPosterior(TargetDensity):
             dict(fixed or {}),
             {},
         )
-        for name, value in zip((f.name for f in fields(self)), values, strict=True):
-            object.__setattr__(self, name, value)
         field = self.reference.model.polynomial.names
         if unknown := sorted(set(self.fixed) - set(field)):
             raise InputError(
@@ -164,19 +162,6 @@ class DitheredPosterior(TargetDensity):
     def parameter_names(self) -> tuple[str, ...]:
         """Coefficients, every frame's own parameters, then x and y of every source."""
         return self.layout.names
-
-    @property
-    def n_parameters(self) -> int:
-        """Length of a parameter vector."""
-        return len(self.parameter_names)
-
-    @cached_property
-    def support(self) -> tuple[Floats, Floats]:
-        """The least and the largest value that the prior admits of every parameter, shape (d,)."""
-        low, high = np.full((2, self.n_parameters), [[-np.inf], [np.inf]])
-        for k, distribution in zip(self._prior_columns, self.prior.values(), strict=True):
-            low[k], high[k] = distribution.support()
-        return low, high
 
     def start(self) -> Floats:
         """Where a search may begin: no distortion, and positions from the frames' catalogues."""
@@ -222,17 +207,25 @@ class DitheredPosterior(TargetDensity):
 
     def log_prior(self, params: npt.ArrayLike) -> Floats:
         """Log-density of the prior for parameter vectors of shape (n, d), flat ones left out."""
-        vectors = self._vectors(params)
         mean, precision = self._pointing_prior
-        off = vectors[:, self._pointing_columns] - mean
-        own = self._log_prior(vectors[:, self._prior_columns])
+        off = self._vectors(params)[:, self._pointing_columns] - mean
+        own = super().log_prior(params)
         return np.asarray(own - 0.5 * np.einsum("nk,kl,nl->n", off, precision, off))
+
+    def prior_gradient(self, params: npt.ArrayLike) -> Floats:
+        """Gradient of the prior's log-density, shape (d,); NaN outside its support."""
+        out = super().prior_gradient(params)
+        mean, precision = self._pointing_prior
+        out[self._pointing_columns] -= precision @ (
+            self._vector(params)[self._pointing_columns] - mean
+        )
+        return out
 
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
-        vector = self._vectors(params)[0]
-        if not np.isfinite(self.log_prior(vector)[0]):
-            return np.full(vector.size, np.nan)
+        vector, out = self._vector(params), self.prior_gradient(params)
+        if np.isnan(out).any():
+            return out
         found: dict[str, Floats] = {}
 
         def evaluate(name: str) -> None:
@@ -241,13 +234,8 @@ class DitheredPosterior(TargetDensity):
             found[name] = np.append(by_params, by_position)
 
         _do([partial(evaluate, name) for name in self.frames])
-        out = np.zeros(vector.size)
         for name in self.frames:
             out += self.layout.change(name, vector).T @ found[name]
-        for k, distribution in zip(self._prior_columns, self.prior.values(), strict=True):
-            out[k] += priors.slope(distribution, vector[k])[0]
-        mean, precision = self._pointing_prior
-        out[self._pointing_columns] -= precision @ (vector[self._pointing_columns] - mean)
         return out
 
     def fisher(self, params: npt.ArrayLike) -> Matrix:
@@ -258,7 +246,7 @@ class DitheredPosterior(TargetDensity):
         sparse matrix, shape (d, d)
             See `movable` for what it neglects.
         """
-        vector = self._vectors(params)[0]
+        vector = self._vector(params)
         found: dict[str, Matrix] = {}
 
         def evaluate(name: str) -> None:
@@ -284,12 +272,10 @@ class DitheredPosterior(TargetDensity):
         names : sequence of str, optional
             Only of these parameters and of the pointings.
         """
-        vector = self._vectors(params)[0]
-        out = np.zeros(vector.size)
-        for k, (name, distribution) in zip(self._prior_columns, self.prior.items(), strict=True):
-            if names is None or name in names:
-                out[k] = max(priors.slope(distribution, vector[k])[1], 0.0)
-        pick = np.zeros((vector.size, self._pointing_columns.size))
+        out = self.prior_curvature(params)
+        if names is not None:
+            out[[name not in names for name in self.parameter_names]] = 0.0
+        pick = np.zeros((out.size, self._pointing_columns.size))
         pick[self._pointing_columns, np.arange(pick.shape[1])] = 1.0
         known = sparse.csr_matrix(pick) @ self._pointing_prior[1] @ pick.T
         return sparse.csr_matrix(known) + sparse.diags(out)
@@ -314,15 +300,6 @@ class DitheredPosterior(TargetDensity):
         return {n: MovableLikelihood.of(frame.likelihood) for n, frame in self.frames.items()}
 
     @cached_property
-    def _prior_columns(self) -> Ints:
-        place = {name: k for k, name in enumerate(self.parameter_names)}
-        return np.array([place[name] for name in self.prior], dtype=np.int64)
-
-    @cached_property
-    def _log_prior(self) -> Any:
-        return priors.log_density(self.prior)
-
-    @cached_property
     def _pointing_columns(self) -> Ints:
         of_others = [part.pointing[:2] for part in self.layout.parts[1:]]
         return np.array(of_others, dtype=np.int64).ravel()
@@ -337,18 +314,6 @@ class DitheredPosterior(TargetDensity):
             return mean, np.zeros((mean.size, mean.size))
         turns = np.vstack([rotation(turn) for turn in given[:, 2]])  # sum R^T d = turns^T d
         return mean, ((np.eye(2 * k) - turns @ turns.T / k) / self.pointing_sd**2)[2:, 2:]
-
-    def _vectors(self, params: npt.ArrayLike) -> Floats:
-        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        if vectors.ndim != 2 or vectors.shape[1] != self.n_parameters:
-            raise InputError(
-                f"params: got shape {np.shape(params)}, expected ({self.n_parameters},) or "
-                f"(n, {self.n_parameters}): see parameter_names"
-            )
-        return vectors
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def _do(tasks: Sequence[Callable[[], None]]) -> None:

@@ -11,7 +11,7 @@ entry. Given phi each nu_i can be found, drawn and judged by itself.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,10 +23,10 @@ from bayesfred.errors import InputError
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.drift import Drift, DriftColumn
+from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.frame_evaluator import FrameEvaluator, LocalFrames
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
-from bayesfred.model.protocol import TargetDensity
 from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.model.shared_parameters import (
     Part,
@@ -39,7 +39,7 @@ from bayesfred.model.shared_parameters import (
 
 @serializable("joint_posterior")
 @dataclass(frozen=True, eq=False, init=False)
-class JointPosterior(TargetDensity):
+class JointPosterior(FrameDensity):
     """Posterior of the parameters that several frames share, and of those that each has.
 
     Parameters
@@ -103,14 +103,11 @@ class JointPosterior(TargetDensity):
         first = next(iter(frames.values()))
         common = lens_terms(first) if shared is None else tuple(dict.fromkeys(shared))
         given = agreed_priors(frames, common, prior or {})
-        values: tuple[Any, ...] = (
-            frames, common, {}, drift, psf_errors, evaluator or LocalFrames(frames)
-        )  # fmt: skip
-        for name, value in zip((f.name for f in fields(self)), values, strict=True):
-            object.__setattr__(self, name, value)
+        where = evaluator or LocalFrames(frames)
+        self._set_fields(frames, common, {}, drift, psf_errors, where)
         object.__setattr__(self, "prior", priors.with_defaults(given, self.parameters))
-        if psf_errors is not None and psf_errors.names != self.parameter_names:
-            raise InputError("psf_errors: got those of other parameters, expected these frames'")
+        if psf_errors is not None:
+            psf_errors.require_names(self.parameter_names)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -132,20 +129,9 @@ class JointPosterior(TargetDensity):
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
-    def n_parameters(self) -> int:
-        """Length of a parameter vector."""
-        return len(self.parameters)
-
-    @property
     def n_shared(self) -> int:
         """Number of parameters that no frame has to itself: the shared ones and their drift."""
         return len(self.shared) + len(self._drifts)
-
-    @cached_property
-    def support(self) -> tuple[Floats, Floats]:
-        """The least and the largest value that the prior admits of every parameter, shape (d,)."""
-        low, high = np.array([distribution.support() for distribution in self.prior.values()]).T
-        return low, high
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
@@ -280,15 +266,9 @@ class JointPosterior(TargetDensity):
         )
         return np.concatenate([np.where(out > -np.inf, out + prior[:-1], out), prior[-1:]])
 
-    def log_prior(self, params: npt.ArrayLike) -> Floats:
-        """Log-density of the prior for parameter vectors of shape (n, d)."""
-        vectors = self._vectors(params)
-        each = [density(vectors[:, some]) for some, density in self._log_priors]
-        return np.asarray(np.sum(each, axis=0))
-
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
-        vector = self._vectors(params)[0]
+        vector = self._vector(params)
         out = self.prior_gradient(vector)
         for part, (slope, _) in zip(self.parts, self.derivatives(vector), strict=True):
             out[: self.n_shared] += part.matrix.T @ slope
@@ -297,8 +277,7 @@ class JointPosterior(TargetDensity):
 
     def fisher(self, params: npt.ArrayLike) -> Floats:
         """Fisher information about the parameters, shape (d, d), without the prior."""
-        vector = self._vectors(params)[0]
-        return self.assembled([each[1] for each in self.derivatives(vector)])
+        return self.assembled([each[1] for each in self.derivatives(params)])
 
     def assembled(self, matrices: Sequence[Floats]) -> Floats:
         """The sum over frames of matrices of their parameters, each (d_i, d_i), as one (d, d)."""
@@ -312,29 +291,12 @@ class JointPosterior(TargetDensity):
             out[np.ix_(part.own, part.own)] = matrix[np.ix_(part.places, part.places)]
         return out
 
-    def information(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information plus prior curvature, shape (d, d)."""
-        return self.fisher(params) + np.diag(self.prior_curvature(params))
-
-    def prior_gradient(self, params: npt.ArrayLike) -> Floats:
-        """Gradient of the prior's log-density, shape (d,); NaN outside its support."""
-        vector = self._vectors(params)[0]
-        if not np.isfinite(self.log_prior(vector)[0]):
-            return np.full(vector.size, np.nan)
-        pairs = zip(self.prior.values(), vector, strict=True)
-        return np.array([priors.slope(p, x)[0] for p, x in pairs])
-
-    def prior_curvature(self, params: npt.ArrayLike) -> Floats:
-        """Curvature of the prior where it is positive, shape (d,)."""
-        pairs = zip(self.prior.values(), self._vectors(params)[0], strict=True)
-        return np.array([max(priors.slope(p, x)[1], 0.0) for p, x in pairs])
-
     def derivatives(self, params: npt.ArrayLike) -> list[tuple[Floats, Floats]]:
         """Gradient and Fisher information of every frame by its own parameters.
 
         Those of the last parameters are kept: a search asks for the two one after the other.
         """
-        vector = self._vectors(params)[0]
+        vector = self._vector(params)
         key, kept = vector.tobytes(), self._kept
         if not kept or kept[0][0] != key:
             vectors = [self._frame_params(part, vector) for part in self.parts]
@@ -386,15 +348,3 @@ class JointPosterior(TargetDensity):
             for j in np.flatnonzero(part.matrix[:, k]):
                 out[..., j] += part.matrix[j, k] * vectors[..., k]
         return np.ascontiguousarray(out)
-
-    def _vectors(self, params: npt.ArrayLike) -> Floats:
-        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        if vectors.ndim != 2 or vectors.shape[1] != self.n_parameters:
-            raise InputError(
-                f"params: got shape {np.shape(params)}, expected vectors of {self.n_parameters} "
-                f"parameters, {self.n_shared} of which are shared by {len(self.frames)} frames"
-            )
-        return vectors
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(self)}

@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,17 +20,17 @@ from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
+from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
 from bayesfred.model.pixels import usable_pixels
-from bayesfred.model.protocol import TargetDensity
 from bayesfred.model.psf_errors import PsfErrors
 
 
 @serializable("posterior")
 @dataclass(frozen=True, eq=False, init=False)
-class Posterior(TargetDensity):
+class Posterior(FrameDensity):
     """Posterior of distortion, background and nuisances given a frame.
 
     Parameters
@@ -112,18 +112,13 @@ class Posterior(TargetDensity):
             raise InputError(
                 "extrapolation: got that of another model, expected this one's: leave it out"
             )
-        values: tuple[Any, ...] = (
+        self._set_fields(
             model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
             extrapolation, np.array(valid, dtype=bool), psf_errors,
         )  # fmt: skip
-        for name, value in zip((f.name for f in fields(self)), values, strict=True):
-            object.__setattr__(self, name, value)
         object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
-        if psf_errors is not None and psf_errors.names != self.parameter_names:
-            raise InputError(
-                f"psf_errors: got those of {', '.join(psf_errors.names)}, expected those of "
-                f"{', '.join(self.parameter_names)}"
-            )
+        if psf_errors is not None:
+            psf_errors.require_names(self.parameter_names)
 
     @cached_property
     def likelihood(self) -> FrameLikelihood:
@@ -146,20 +141,9 @@ class Posterior(TargetDensity):
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
-    def n_parameters(self) -> int:
-        """Length of a parameter vector."""
-        return len(self.parameters)
-
-    @property
     def hyperparameters(self) -> tuple[str, ...]:
         """Scale parameters, on which proposals nest the Laplace approximation."""
         return ("position_scatter",) if self.nuisances.position_scatter else ()
-
-    @cached_property
-    def support(self) -> tuple[Floats, Floats]:
-        """The least and the largest value that the prior admits of every parameter, shape (d,)."""
-        low, high = np.array([distribution.support() for distribution in self.prior.values()]).T
-        return low, high
 
     def start(self) -> Floats:
         """Parameters to begin a search from: no distortion, the frame's median as background."""
@@ -183,27 +167,19 @@ class Posterior(TargetDensity):
         InputError
             If a parameter vector has another length.
         """
-        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        if vectors.ndim != 2 or vectors.shape[1] != self.n_parameters:
-            raise self._wrong_shape(params, f"({self.n_parameters},) or (n, {self.n_parameters})")
-        prior = self._log_prior(vectors)
+        vectors = self._vectors(params)
+        prior = self.log_prior(vectors)
         out = self.likelihood.log_likelihood(vectors, prior > -np.inf)
         out = np.where(out > -np.inf, out + prior, out)
         out[np.isnan(prior)] = np.nan
         return float(out[0]) if np.ndim(params) == 1 else out
 
-    def log_prior(self, params: npt.ArrayLike) -> Floats:
-        """Log-density of the prior for parameter vectors of shape (n, d)."""
-        vectors = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        return np.asarray(self._log_prior(vectors))
-
     def gradient(self, params: npt.ArrayLike) -> Floats:
         """Exact gradient of `log_prob`, shape (d,); NaN outside the prior's support."""
-        vector = self._vector(params)
-        if not np.isfinite(self.log_prior(vector)[0]):
-            return np.full(vector.size, np.nan)
-        slopes = [priors.slope(p, x)[0] for p, x in zip(self.prior.values(), vector, strict=True)]
-        return self.likelihood.gradient(vector) + slopes
+        slope = self.prior_gradient(params)
+        if np.isnan(slope).any():
+            return slope
+        return self.likelihood.gradient(self._vector(params)) + slope
 
     def fisher(self, params: npt.ArrayLike) -> Floats:
         """Fisher information of the frame about the parameters, free fluxes profiled out.
@@ -217,18 +193,6 @@ class Posterior(TargetDensity):
         if not np.isfinite(self.log_prior(vector)[0]):
             return np.full((vector.size, vector.size), np.nan)
         return self.likelihood.fisher(vector)
-
-    def information(self, params: npt.ArrayLike) -> Floats:
-        """Fisher information plus prior curvature, shape (d, d).
-
-        The inverse is the covariance of the Laplace approximation with the PSF fixed.
-        """
-        return self.fisher(params) + self.prior_information(params)
-
-    def prior_information(self, params: npt.ArrayLike) -> Floats:
-        """Curvature of the prior where it is positive, shape (d, d)."""
-        pairs = zip(self.prior.values(), self._vector(params), strict=True)
-        return np.diag([max(priors.slope(p, x)[1], 0.0) for p, x in pairs])
 
     def near(self, params: Floats, covariance: Floats) -> "Posterior":
         """The same posterior, with a faster `log_prob` around `params` where fluxes are free.
@@ -315,21 +279,3 @@ class Posterior(TargetDensity):
         Free fluxes are those at which the density of their logarithms is highest.
         """
         return self.likelihood.fluxes(self._vector(params))
-
-    @cached_property
-    def _log_prior(self) -> Any:
-        return priors.log_density(self.prior)
-
-    def _vector(self, params: npt.ArrayLike) -> Floats:
-        """One parameter vector; several are refused."""
-        vector = np.asarray(params, dtype=np.float64)
-        if vector.shape != (self.n_parameters,):
-            raise self._wrong_shape(params, f"one vector of shape ({self.n_parameters},)")
-        return vector
-
-    def _wrong_shape(self, params: npt.ArrayLike, expected: str) -> InputError:
-        names = ", ".join(self.parameter_names)
-        return InputError(f"params: got shape {np.shape(params)}, expected {expected} for {names}")
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(self)}

@@ -67,6 +67,14 @@ class PsfErrors:
         if self.covariance.shape != (d, d):
             raise InputError(f"psf_errors: got shape {self.covariance.shape}, expected ({d}, {d})")
 
+    def require_names(self, names: tuple[str, ...]) -> None:
+        """Refuse errors of other parameters than these."""
+        if self.names != names:
+            raise InputError(
+                f"psf_errors: got those of {', '.join(self.names)}, expected those of "
+                f"{', '.join(names)}"
+            )
+
     @classmethod
     def of(
         cls,

@@ -89,7 +89,7 @@ class _CompileResults(CompileResultCacheImpl):  # type: ignore[misc]
         return _calls(cres.library), super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Read a function; None where what it calls has been compiled anew since."""
+        """Read a function; None where what it calls has been compiled again since."""
         calls, function = payload
         if not all(call.is_there() for call in calls):
             return None
