@@ -185,6 +185,7 @@ def test_causes_of_odd_frames_are_sentences(name: str) -> None:
         assert text.isprintable() and "nan" not in text.split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read_noise", [0.3, np.full(planted.SHAPE, 0.5)])
 def test_read_noise_counts_as_variance(read_noise: Any) -> None:
     """Information is not its inverse: at 0.05 counts a pixel of sky they differ threefold."""

@@ -312,6 +312,7 @@ def deviations(plan: Design, errors: Floats, covariance: Floats) -> tuple[float,
     return float(whole), float(np.abs(z).max())
 
 
+@pytest.mark.slow
 def test_predicted_errors_are_those_of_refits() -> None:
     """200 frames. The field's mean square within 4 Monte Carlo errors, each point's within 5.
 

@@ -39,6 +39,7 @@ def weights(target: bf.Posterior, nodes: Floats) -> Floats:
     return np.asarray(np.exp(log - log.max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [(0.0,), (-1.0, 1.0)])
 @pytest.mark.parametrize("flux", [5.0, 500.0])
 def test_fluxes_are_drawn_from_their_posterior(x: tuple[float, ...], flux: float) -> None:
@@ -62,6 +63,7 @@ def test_fluxes_are_drawn_from_their_posterior(x: tuple[float, ...], flux: float
             )
 
 
+@pytest.mark.slow
 def test_a_close_pair_needs_several_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half a width apart. Of 400 draws a standard deviation has an error of 3.5 %."""
     target, params = posterior((-0.5, 0.5), 500.0), np.array([0.0, 1.0])

@@ -119,6 +119,7 @@ def test_the_pit_of_a_wrong_distribution_is_not(true: Noise, assumed: Noise) -> 
     assert uniformity(true, assumed, 4.0) < 1e-4
 
 
+@pytest.mark.slow
 def test_noise_without_a_distribution_function_is_not_tested() -> None:
     noise = VarianceNoise(np.full(SHAPE, 9.0))
     posterior, _ = frame(2, noise=noise)

@@ -383,6 +383,7 @@ class Counting:
         return self.pool.submit(function, *args)
 
 
+@pytest.mark.slow
 def test_a_pool_gives_the_same_bits_and_gets_the_study_once_a_worker(tmp_path: Path) -> None:
     here, there = tmp_path / "here.ecsv", tmp_path / "there.ecsv"
     levels(here, replicates=10)
@@ -788,6 +789,7 @@ def test_a_scheduler_that_is_not_there(study: Callable[..., bool]) -> None:
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_an_interrupt_keeps_everything(
     study: Callable[..., bool], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -434,6 +434,7 @@ def check(files: Files, drawn: bool, *, everything: bool) -> None:
             assert np.isfinite(chain.log_prob).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=50, derandomize=True, deadline=None, suppress_health_check=[*HealthCheck])
 @given(inputs(), DRAWN)
 def test_a_result_or_one_line(files: Files, drawn: bool) -> None:

@@ -263,6 +263,7 @@ def p_values(number: int, *, doubt: float = 1.0) -> Floats:
     return np.array([a.difference(b).agreement.p for a, b in pairs(number, doubt=doubt)])
 
 
+@pytest.mark.slow
 def test_difference_has_uniform_p_values() -> None:
     """60 pairs without a change: a Kolmogorov test at 0.001.
 

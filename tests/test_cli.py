@@ -229,6 +229,7 @@ def test_a_psf_that_is_too_wide_is_not_trusted(folder: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_python_callers_hear_nothing_unless_they_ask(
     folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -307,6 +308,7 @@ def test_report_rebuilds_page_and_picture(finished: tuple[Path, Output], tmp_pat
     ]  # a reader takes no lock
 
 
+@pytest.mark.slow
 def test_report_that_asks_for_more_than_there_is_exits_with_3(
     finished: tuple[Path, Output], tmp_path: Path
 ) -> None:
@@ -352,6 +354,7 @@ def test_verify_says_what_holds(finished: tuple[Path, Output], tmp_path: Path) -
     assert f"made with numpy 1.0 (here {np.__version__})" in output.stdout
 
 
+@pytest.mark.slow
 def test_too_few_steps_then_resume_then_overwrite(folder: Path) -> None:
     (folder / "run.toml").write_text(run_text(sampling=FEW_STEPS), encoding="utf-8")
     first = invoke(folder, "fit", "run.toml")
@@ -1009,6 +1012,7 @@ def test_saturated_and_lost_pixels_are_counted_on_screen_and_page(folder: Path) 
     np.testing.assert_array_equal(mask, np.isfinite(counts) & (counts < 5000))
 
 
+@pytest.mark.slow
 def test_outliers_are_rejected_if_asked_for(folder: Path) -> None:
     """The catalogue lacks a star of the frame, and has one of 5,000 photons that is not there."""
     lines = (folder / "stars.csv").read_text().splitlines()
@@ -1063,6 +1067,7 @@ def open_model(run: RunSettings, x: float) -> ForwardModel:
     return build.forward_model(run, (60, 75), sources, GaussianPSF(2.5))
 
 
+@pytest.mark.slow
 def test_zero_background(folder: Path) -> None:
     """Pixels without light and without counts."""
     sections(simulation="shape = [60, 75]\nbackground = 0", sampling=FEW_STEPS)(folder)
@@ -1327,6 +1332,7 @@ def test_an_interrupt_says_what_is_true(
     assert output.stderr.splitlines() == ["bayesfred: interrupted; nothing had to be saved"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_termination_saves_the_steps(name: str, simulated: Path, tmp_path: Path) -> None:
     """SIGTERM, as batch systems send it, and a closed terminal end a run as Ctrl-C does."""
@@ -1365,6 +1371,7 @@ def test_ctrl_c_in_a_likelihood_says_one_line(
     assert "Traceback" not in output.stdout
 
 
+@pytest.mark.slow
 def test_log_probabilities_that_are_no_numbers_are_counted(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1439,6 +1446,7 @@ def test_paths_are_beside_the_run_file_then_in_the_data_folder(
     assert_refused(invoke(away, "fit", run_file), str(folder / "frame.fits"))
 
 
+@pytest.mark.slow
 def test_default_output_is_in_chains_here_and_named_after_the_run_file(
     folder: Path, tmp_path: Path
 ) -> None:

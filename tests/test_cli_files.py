@@ -70,6 +70,7 @@ def of_another_run(path: Path) -> None:
     shutil.rmtree(other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -88,6 +89,7 @@ def test_resuming_replaces_nothing_that_the_run_did_not_make(
     )
 
 
+@pytest.mark.slow
 def test_resuming_replaces_what_the_run_made(here: Path) -> None:
     before = snapshot(here)
     longer, more = FEW_STEPS.replace("12", "14"), STUDY.replace("2", "3")
@@ -121,6 +123,7 @@ def test_a_study_does_not_take_a_catalogue_or_a_picture_of_a_fit(here: Path) -> 
     refused(here, *args, "--resume", words=("run.png: exists", "not as this run wrote it"))
 
 
+@pytest.mark.slow
 def test_what_comes_while_a_run_is_made_stays(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A page that somebody put there between the beginning of a fit and its end."""
     for name in ("run.h5", *PRODUCTS):

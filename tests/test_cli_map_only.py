@@ -49,6 +49,7 @@ def test_errors_are_those_of_the_sampled_run(
     assert abs(ratio - 1).max() < 4 * (0.5 / 200 + 0.5 / 1000) ** 0.5
 
 
+@pytest.mark.slow
 def test_report_verify_and_compare(
     mapped: tuple[Path, Output], finished: tuple[Path, Output], tmp_path: Path
 ) -> None:
@@ -69,6 +70,7 @@ def test_report_verify_and_compare(
     assert compared.code == 0 and "chosen: " in compared.stdout
 
 
+@pytest.mark.slow
 def test_nothing_is_replaced_or_resumed_unasked(
     mapped: tuple[Path, Output], tmp_path: Path
 ) -> None:

@@ -12,6 +12,8 @@ import bayesfred as bf
 from bayesfred.analysis.verify import verify
 from bayesfred.sampling.chainfile import open_chain
 
+pytestmark = pytest.mark.slow
+
 RUN = """
 [frame]
 path = "{frame}"

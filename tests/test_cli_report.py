@@ -78,6 +78,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_settings_on_the_page_make_the_same_draws(finished: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(finished, tmp_path / "here"))
     (folder / "again.toml").write_text(settings_on(folder / "chains" / "run.html"))
@@ -87,6 +88,7 @@ def test_settings_on_the_page_make_the_same_draws(finished: Path, tmp_path: Path
     np.testing.assert_array_equal(before.chain, after.chain)
 
 
+@pytest.mark.slow
 def test_settings_of_a_resumed_run_make_its_draws(finished: Path, tmp_path: Path) -> None:
     """Those that cannot are refused, and change nothing."""
     folder = Path(shutil.copytree(finished, tmp_path / "here"))
@@ -120,6 +122,7 @@ def test_report_keeps_settings_notes_and_date_and_shows_the_pairs_asked_for(
     assert "Posterior: other parameters" not in text_on(before)
 
 
+@pytest.mark.slow
 def test_report_replaces_nothing_unasked(finished: Path, tmp_path: Path) -> None:
     shutil.copy(finished / "chains" / "run.h5", tmp_path)
     for name in ("run.html", "run.png"):
@@ -156,6 +159,7 @@ def test_report_refuses_in_one_line(
     assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
 
 
+@pytest.mark.slow
 def test_page_shows_truth_again(finished: Path, tmp_path: Path) -> None:
     chain = open_chain(finished / "chains" / "run.h5")
     assert chain.record is not None and chain.record.truth is None
@@ -182,6 +186,7 @@ def two(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_compare_writes_a_page_if_asked_and_replaces_none(two: Path, tmp_path: Path) -> None:
     before = sorted(two.iterdir())
     assert invoke(two, "compare", "a.h5", "b.h5")[0] == 0
@@ -220,6 +225,7 @@ def test_badly_sampled_runs_are_not_ranked(two: Path, finished: Path, tmp_path: 
     assert "short.h5: got draws that do not represent the posterior" in said
 
 
+@pytest.mark.slow
 def test_runs_that_cannot_be_ranked_are_shown_side_by_side(two: Path, tmp_path: Path) -> None:
     """Of other counts, for one; the exit code says that there is no ranking."""
     folder = Path(shutil.copytree(two, tmp_path / "here"))

@@ -74,6 +74,7 @@ def table_lines(text: str) -> list[str]:
     return [line for line in plain.splitlines() if line[:1] in "┏┃┡│└+|"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("columns", "present", "absent"),
     [
@@ -94,6 +95,7 @@ def test_a_table_fits_the_terminal(
     assert "…" not in shown and all(any(f" {name} " in line for line in lines) for name in NAMES)
 
 
+@pytest.mark.slow
 def test_plain_terminals_get_plain_text(folder: Path) -> None:
     """The negative control is a terminal that can do more: it gets escape codes."""
     (folder / "run.toml").write_text(run_text(sampling="steps = 12"), encoding="utf-8")
@@ -110,6 +112,7 @@ def test_plain_terminals_get_plain_text(folder: Path) -> None:
             assert "12 steps" in errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extra", "width", "ascii"),
     [
@@ -202,6 +205,7 @@ def test_a_ranking_of_long_paths_fits() -> None:
         assert text.count("x") == 180
 
 
+@pytest.mark.slow
 def test_json_is_one_object_and_all_else_is_on_standard_error(
     finished: tuple[Path, Any], folder: Path
 ) -> None:
@@ -278,6 +282,7 @@ def test_long_work_is_never_silent(terminal: bool, show: bool) -> None:
     assert "bayesfred-wait" not in [thread.name for thread in threading.enumerate()]
 
 
+@pytest.mark.slow
 def test_a_notebook_gets_no_widgets_and_no_warnings(folder: Path) -> None:
     """As in a Jupyter kernel, where rich finds this shell and would show widgets."""
     code = """

@@ -218,6 +218,7 @@ def test_box_pixels_equal_fine_quadrature(psf: PSF, binning: int) -> None:
     )
 
 
+@pytest.mark.slow
 def test_jacobian_equals_central_differences(psf: PSF) -> None:
     rng = np.random.default_rng(83)
     for detector in (Detector((40, 51)), Detector((20, 25), 2, "box")):
@@ -313,6 +314,7 @@ def make_posterior(
     return posterior, truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["scale", pytest.param("free, scattered, box", marks=LONG)])
 def test_gradient_is_that_of_log_prob(psf: PSF, case: str) -> None:
     posterior, truth = make_posterior(psf, *CASES[case], 85)
@@ -331,6 +333,7 @@ def slopes_and_their_derivatives(profile: Any, a: float, b: float) -> Any:
     return psf_slopes(profile, a, b), psf_second_derivatives(profile, a, b)
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_slopes(psf: PSF) -> None:
     """A family's methods return p, -p_a, -p_b, and then -p_a, -p_b, p_aa, p_ab, p_bb."""
     rng, step = np.random.default_rng(89), 1e-4

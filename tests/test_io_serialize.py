@@ -368,6 +368,7 @@ JUNK = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=300, derandomize=True, deadline=None)
 @given(st.data())
 def test_any_spoilt_posterior_is_read_or_refused_in_one_line(data: st.DataObject) -> None:

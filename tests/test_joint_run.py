@@ -30,6 +30,8 @@ from bayesfred.results import How, Job, make_chain
 from bayesfred.sections import toml
 from bayesfred.settings import read_settings
 
+pytestmark = pytest.mark.slow
+
 LENS = {"f_x2": 5e-4, "g_y2": -4e-4}
 POSES = {"a": (0.0, 0.0), "b": (1e-3, -2e-3), "c": (2e-3, -4e-3)}
 LEVELS = {"a": 3.0, "b": 4.0, "c": 5.0}

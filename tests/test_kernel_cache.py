@@ -104,6 +104,7 @@ def test_an_edited_kernel_is_compiled_again(package: Path, arguments: tuple[str,
     assert printed(package, POLYNOMIAL, *arguments) == (17.0 if arguments else 18.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [(), ("numba alone",)])
 def test_an_edited_psf_from_outside_is_compiled_again(
     package: Path, arguments: tuple[str, ...]
@@ -150,6 +151,7 @@ print(names.count("linear"))
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [(), ("numba alone",)])
 def test_of_processes_that_need_a_function_one_compiles_it(
     package: Path, arguments: tuple[str, ...]

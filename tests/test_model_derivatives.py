@@ -125,6 +125,7 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
 COSTLY = pytest.param("free, gaussian", marks=pytest.mark.long)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [COSTLY if case in COSTLY.values else case for case in CASES])
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     model, nuisances, noise, background = CASES[case]
@@ -226,6 +227,7 @@ def score_excess(scores: Floats, information: Floats) -> float:
 SCORED = [(EVERYTHING, PoissonNoise()), (Nuisances("scale", offset=True), BackgroundNoise())]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("nuisances", "noise"), SCORED)
 def test_fisher_is_the_covariance_of_the_score(nuisances: Nuisances, noise: Noise) -> None:
     rng = np.random.default_rng(23)

@@ -138,6 +138,7 @@ def test_log_prob_is_the_sum_over_all_pixels(case: str) -> None:
     assert same == pytest.approx(terms, rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["photons", *COSTLY, *COSTLIER])
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     posterior, truth = frame(case)

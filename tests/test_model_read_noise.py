@@ -204,6 +204,7 @@ def test_bright_dark_and_masked_pixels_are_summed_alike(r: float) -> None:
     assert ours == pytest.approx(theirs, rel=1e-8 if r < 1.0 else 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(k, marks=[pytest.mark.long] * (k == "map")) for k in FRAMES]
 )
@@ -219,6 +220,7 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_map_of_equal_read_noises_is_one_read_noise() -> None:
     posterior, params = frame("large")
     equal = Posterior(
@@ -342,6 +344,7 @@ def test_compare_prefers_the_true_read_noise() -> None:
 # --- files ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read_noise", [0.0, 2.0, MAP])
 def test_chains_of_the_shifted_poisson_are_refused(read_noise: Any, tmp_path: Path) -> None:
     distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])

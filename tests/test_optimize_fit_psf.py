@@ -49,6 +49,7 @@ def crowded(rng, n_pixels=40, n_sources=3):
     return SourceSamples(first, source, a, b, rng.uniform(0.9, 1.1, size))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "wings"), [(1, True), (1, False), (0, True), (0, False)])
 def test_information_and_slope_agree_with_a_dense_design_matrix(degree, wings):
     rng = np.random.default_rng(1)
@@ -204,6 +205,7 @@ def comatic():
     return bf.MeasuredPSF(np.stack([core, *coma]), 4.0, 60.0)
 
 
+@pytest.mark.slow
 def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
     true = comatic()
     _, _, posterior = frame_of(true, 2.8, pixel="impulse")

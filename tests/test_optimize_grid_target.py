@@ -290,6 +290,7 @@ def message(counts: Array, target: GridTarget, width: float = WIDTH) -> str:
     return str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 @pytest.mark.parametrize("marks", ["pinholes", "dots"])
 def test_frames_without_a_grid(layout: Any, marks: Any) -> None:

@@ -221,6 +221,7 @@ def longest_rest(coords: Floats) -> int:
     return longest
 
 
+@pytest.mark.slow
 def test_without_adaptation_the_run_stalls(easy: Posterior, estimate: MapEstimate) -> None:
     """Negative control: the moves that a run would keep making, on the same walkers."""
     wrong = replace(estimate, covariance=25.0 * estimate.covariance)

@@ -183,6 +183,7 @@ def test_gradient_is_that_of_log_prob(nuisances: Nuisances, detector: Detector) 
     )
 
 
+@pytest.mark.slow
 def test_fit_finds_the_truth_which_a_circular_one_does_not_explain() -> None:
     posterior, truth = made(Nuisances("scale", psf_sigma=True))
     best = find_map(posterior)

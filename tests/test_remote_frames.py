@@ -38,6 +38,8 @@ from bayesfred.model.frame_evaluator import FrameEvaluator, LocalFrames
 from bayesfred.model.joint import JointPosterior
 from bayesfred.sampling.chainfile import open_chain
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[1] / "examples" / "many_workers.md"
 NAMES = ["a", "b", "c", "d", "e"]
 

@@ -514,7 +514,13 @@ def test_a_run_to_a_target_resumes_to_the_same_draws(
     ) == draws_of(whole)
 
 
-@pytest.mark.parametrize("nuisances", [Nuisances(), Nuisances("free")], ids=["fixed", "free"])
+@pytest.mark.parametrize(
+    "nuisances",
+    [
+        pytest.param(Nuisances(), id="fixed"),
+        pytest.param(Nuisances("free"), id="free", marks=pytest.mark.slow),
+    ],
+)
 def test_the_seed_alone_makes_the_draws(
     posterior: Posterior, tmp_path: Path, nuisances: Nuisances
 ) -> None:
@@ -906,6 +912,7 @@ POSTERIORS: list[tuple[Nuisances, Any, Detector, bool]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("nuisances", "noise", "detector", "conserve_flux"), POSTERIORS)
 def test_the_posterior_is_rebuilt(
     tmp_path: Path, nuisances: Nuisances, noise: Any, detector: Detector, conserve_flux: bool

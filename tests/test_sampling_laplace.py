@@ -152,6 +152,7 @@ def test_what_cannot_be_done_is_one_line(
     assert open_chain(path).method == sampled.method == "mcmc"
 
 
+@pytest.mark.slow
 def test_importance_efficiency_is_that_of_the_two_densities() -> None:
     """The posterior N(0, s^2) drawn from N(0, 1): s sqrt(2 - s^2), without draws from its tails.
 
