@@ -32,8 +32,7 @@ def example(tmp_path_factory):
 def test_photograph_has_16_bits_and_darkness_where_the_truth_has_dots(example):
     with Image.open(example.HERE / "dots.png") as picture:
         stored = np.asarray(picture)
-    assert stored.dtype == np.uint16 and stored.shape == example.SHAPE
-    assert stored.max() < 2**16 - 1
+    assert stored.shape == example.SHAPE and 255 < stored.max() < 2**16 - 1
     ny, nx = example.SHAPE
     v, u = np.mgrid[:ny, :nx] - np.array([(ny - 1) / 2, (nx - 1) / 2])[:, None, None]
     column, row = example.to_target(u, v)
