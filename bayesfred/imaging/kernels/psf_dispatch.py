@@ -14,6 +14,14 @@ polynomial on a row of pixels:
     radial_scale(psf)                c
     radial(psf, z)                   p where z = c (a^2 + b^2)
 
+One that has to look something up does so for all pixels of a row at once, and needs no `value`:
+
+    new_places(psf, width)              room for a row's places in the table
+    find_places(psf, t0, ramp, work, degree, places)
+                                        fill it: a and b are the polynomials work[2] and work[3]
+                                        of that degree in t = t0 + ramp[n]
+    at_place(psf, places, n)            p in the row's pixel n
+
 A family that varies over the field has instead `of_source(psf, s)`: the compiled half of another
 family, the PSF of source s.
 
@@ -68,7 +76,16 @@ def _fill_plane(psf, source, w, sigma, work, degrees):
         work[3, m] /= sigma
 
 
-def _radial_on_row(psf, t, r, ra, rb, degrees):
+def _no_places(psf, width):
+    return ()
+
+
+def _find_none(psf, t0, ramp, work, degree, places):
+    pass
+
+
+def _radial_on_row(psf, t, n, work, degrees, places):
+    r = work[0]
     top = len(degrees.q)
     z = r[top]
     for m in range(top):
@@ -76,7 +93,8 @@ def _radial_on_row(psf, t, r, ra, rb, degrees):
     return _radial(psf, z)
 
 
-def _plane_on_row(psf, t, r, ra, rb, degrees):
+def _plane_on_row(psf, t, n, work, degrees, places):
+    ra, rb = work[2], work[3]
     top = len(degrees.ab)
     a, b = ra[top], rb[top]
     for m in range(top):
@@ -86,6 +104,21 @@ def _plane_on_row(psf, t, r, ra, rb, degrees):
 
 
 # Fill the rows 0, 2 and 3 of `work` with the polynomials on the row at v = v_peak + w, from which
-# `psf_on_row` makes p at u = u_peak + t.
+# `psf_on_row` makes p at u = u_peak + t, in the row's pixel n.
 fill_psf_row = by_type(lambda family: _fill_radial if hasattr(family, "radial") else _fill_plane)
-psf_on_row = by_type(lambda family: _radial_on_row if hasattr(family, "radial") else _plane_on_row)
+new_places = by_type(lambda family: getattr(family, "new_places", _no_places))
+find_places = by_type(lambda family: getattr(family, "find_places", _find_none))
+_at_place = by_type(lambda family: family.at_place)
+
+
+def _placed_on_row(psf, t, n, work, degrees, places):
+    return _at_place(psf, places, n)
+
+
+def _choose_on_row(family: Any) -> Callable[..., Any]:
+    if hasattr(family, "radial"):
+        return _radial_on_row
+    return _placed_on_row if hasattr(family, "at_place") else _plane_on_row
+
+
+psf_on_row = by_type(_choose_on_row)

@@ -18,6 +18,8 @@ from bayesfred.imaging.kernels.geometry import (
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.psf_dispatch import (
     fill_psf_row,
+    find_places,
+    new_places,
     psf_of_source,
     psf_on_row,
     psf_slopes,
@@ -42,9 +44,9 @@ def add_source(layout, s, rows, flux, canvas, alone):
     lows, js, sizes = fp.low, fp.row, fp.size
     out, at = canvas.image, canvas.at
     middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
-    r, rd, ra, rb, ramp = work[0], work[1], work[2], work[3], o.ramp
+    rd, ramp = work[1], o.ramp
     psf = psf_of_source(o.psf, source.number)
-    degrees = o.degrees
+    degrees, places = o.degrees, new_places(psf, ramp.size)
     d_top = len(degrees.d)
     norm = flux * psf.norm / (sigma * sigma)
     for i in range(rows[0], rows[1]):
@@ -57,12 +59,13 @@ def add_source(layout, s, rows, flux, canvas, alone):
             for x in range(offsets.size):
                 polynomial_on_row(d, w + offsets[y], norm * weights[y] * weights[x], rd, degrees.d)
                 t0 = t_low + offsets[x]
+                find_places(psf, t0, ramp[: row.size], work, degrees.ab, places)
                 for n in range(row.size):
                     t = t0 + ramp[n]
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
-                    value = psf_on_row(psf, t, r, ra, rb, degrees) * abs(j)
+                    value = psf_on_row(psf, t, n, work, degrees, places) * abs(j)
                     row[n] += value
                     if alone is not None:
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)

@@ -7,13 +7,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 from scipy import linalg, ndimage, special
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.imaging.kernels.splines import (
+    spline_cell,
+    spline_second_derivatives,
+    spline_slopes,
+    spline_value,
+)
 from bayesfred.io.serialize import serializable
 
 MOST_SAMPLES = 1001  # a side
@@ -32,38 +37,47 @@ class SplineProfile(NamedTuple):
     scale: float  # samples per width
 
     @staticmethod
-    def value(psf: Any, a: Any, b: Any) -> Any:
-        i, x = _cell(psf.c.shape[1], psf.scale * a)
-        j, y = _cell(psf.c.shape[0], psf.scale * b)
-        return _inner(_weights(y), _four(psf.c, j, i, _weights(x)))
-
-    @staticmethod
     def slopes(psf: Any, a: Any, b: Any) -> Any:
         k = psf.scale
-        i, x = _cell(psf.c.shape[1], k * a)
-        j, y = _cell(psf.c.shape[0], k * b)
-        rows, slopes, v = (
-            _four(psf.c, j, i, _weights(x)),
-            _four(psf.c, j, i, _slopes(x)),
-            _weights(y),
-        )
-        return _inner(v, rows), -k * _inner(v, slopes), -k * _inner(_slopes(y), rows)
+        i, x = spline_cell(psf.c.shape[1], k * a)
+        j, y = spline_cell(psf.c.shape[0], k * b)
+        p, p_x, p_y = spline_slopes(psf.c, j * psf.c.shape[1] + i, y, x)
+        return p, -k * p_x, -k * p_y
 
     @staticmethod
     def second_derivatives(psf: Any, a: Any, b: Any) -> Any:
         k = psf.scale
-        i, x = _cell(psf.c.shape[1], k * a)
-        j, y = _cell(psf.c.shape[0], k * b)
-        rows, slopes = _four(psf.c, j, i, _weights(x)), _four(psf.c, j, i, _slopes(x))
-        curves = _four(psf.c, j, i, _second_derivatives(x))
-        v, e = _weights(y), _slopes(y)
-        return (
-            -k * _inner(v, slopes),
-            -k * _inner(e, rows),
-            k * k * _inner(v, curves),
-            k * k * _inner(e, slopes),
-            k * k * _inner(_second_derivatives(y), rows),
-        )
+        i, x = spline_cell(psf.c.shape[1], k * a)
+        j, y = spline_cell(psf.c.shape[0], k * b)
+        p_x, p_y, p_xx, p_xy, p_yy = spline_second_derivatives(psf.c, j * psf.c.shape[1] + i, y, x)
+        return -k * p_x, -k * p_y, k * k * p_xx, k * k * p_xy, k * k * p_yy
+
+    @staticmethod
+    def new_places(psf: Any, width: Any) -> Any:
+        return np.empty(width, np.int64), np.empty(width), np.empty(width)
+
+    @staticmethod
+    def find_places(psf: Any, t0: Any, ramp: Any, work: Any, degree: Any, places: Any) -> Any:
+        # two loops: one would have more arrays than a compiler tells apart, and be no SIMD loop
+        at, y, x = places
+        a, b, c, scale, top = work[2], work[3], psf.c, psf.scale, len(degree)
+        for n in range(ramp.size):
+            t = t0 + ramp[n]
+            z = b[top]
+            for m in range(top):
+                z = z * t + b[top - 1 - m]
+            at[n], y[n] = spline_cell(c.shape[0], scale * z)
+        for n in range(ramp.size):
+            t = t0 + ramp[n]
+            z = a[top]
+            for m in range(top):
+                z = z * t + a[top - 1 - m]
+            i, x[n] = spline_cell(c.shape[1], scale * z)
+            at[n] = at[n] * c.shape[1] + i
+
+    @staticmethod
+    def at_place(psf: Any, places: Any, n: Any) -> Any:
+        return spline_value(psf.c, places[0][n], places[1][n], places[2][n])[0]
 
 
 class FieldProfile(NamedTuple):
@@ -76,67 +90,6 @@ class FieldProfile(NamedTuple):
     @staticmethod
     def of_source(psf: Any, s: Any) -> Any:
         return SplineProfile(psf.norm, psf.c[s], psf.scale)
-
-
-@nb.njit(inline="always")
-def _cell(size: Any, x: Any) -> Any:
-    """The first of the four coefficients that matter at x, and where x is in the cell.
-
-    x is in samples from the middle. Beyond the outermost coefficients the spline is zero, as it is
-    among the last four.
-    """
-    x = min(max(x + 0.5 * (size - 1), 1.0), size - 2.5)
-    i = np.int64(x)
-    return i - 1, x - i
-
-
-@nb.njit(inline="always")
-def _weights(f: Any) -> Any:
-    """The B-splines of four neighbouring samples, f of a step after the second."""
-    g = 1.0 - f
-    return (
-        g * g * g / 6.0,
-        2.0 / 3.0 - f * f * (1.0 - 0.5 * f),
-        2.0 / 3.0 - g * g * (1.0 - 0.5 * g),
-        f * f * f / 6.0,
-    )
-
-
-@nb.njit(inline="always")
-def _slopes(f: Any) -> Any:
-    g = 1.0 - f
-    return -0.5 * g * g, f * (1.5 * f - 2.0), -g * (1.5 * g - 2.0), 0.5 * f * f
-
-
-@nb.njit(inline="always")
-def _second_derivatives(f: Any) -> Any:
-    g = 1.0 - f
-    return g, 3.0 * f - 2.0, 3.0 * g - 2.0, f
-
-
-@nb.njit(inline="always")
-def _inner(p: Any, q: Any) -> Any:
-    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
-
-
-@nb.njit(inline="always")
-def _four(c: Any, j: Any, i: Any, w: Any) -> Any:
-    """The weighted sums of four coefficients on four rows."""
-    return (
-        w[0] * c[j, i] + w[1] * c[j, i + 1] + w[2] * c[j, i + 2] + w[3] * c[j, i + 3],
-        w[0] * c[j + 1, i]
-        + w[1] * c[j + 1, i + 1]
-        + w[2] * c[j + 1, i + 2]
-        + w[3] * c[j + 1, i + 3],
-        w[0] * c[j + 2, i]
-        + w[1] * c[j + 2, i + 1]
-        + w[2] * c[j + 2, i + 2]
-        + w[3] * c[j + 2, i + 3],
-        w[0] * c[j + 3, i]
-        + w[1] * c[j + 3, i + 1]
-        + w[2] * c[j + 3, i + 2]
-        + w[3] * c[j + 3, i + 3],
-    )
 
 
 @serializable("psf.sampled")
