@@ -237,8 +237,7 @@ class Careless(FrameMove):
         return 0.0 * super()._redraw(i, x, random)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("k", [1, 4])
+@pytest.mark.parametrize("k", [1, pytest.param(4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("together", [False, True, None])
 def test_frame_moves_sample_the_right_distribution(k: int, together: bool | None) -> None:
     """Quantiles of phi and of nu_i - phi, whether frames are drawn together or one by one.

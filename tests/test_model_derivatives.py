@@ -121,12 +121,15 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
 }
 
 
-# what costs most to compile is among the long runs
-COSTLY = pytest.param("free, gaussian", marks=pytest.mark.long)
+# what costs most to compile is not in the default run
+COSTLY = {
+    "gaussian": pytest.mark.slow,
+    "variance image": pytest.mark.slow,
+    "free, gaussian": pytest.mark.long,
+}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [COSTLY if case in COSTLY.values else case for case in CASES])
+@pytest.mark.parametrize("case", [pytest.param(c, marks=COSTLY.get(c, ())) for c in CASES])
 def test_gradient_is_that_of_log_prob(case: str) -> None:
     model, nuisances, noise, background = CASES[case]
     rng = np.random.default_rng(20)
@@ -198,7 +201,7 @@ def test_fisher_is_that_of_the_dense_jacobian(case: str) -> None:
         "free, touching",
         "free, overlapping",
         "free, few photons",
-        COSTLY,
+        pytest.param("free, gaussian", marks=COSTLY["free, gaussian"]),
     ],
 )
 def test_fisher_with_free_fluxes_is_the_schur_complement(case: str) -> None:

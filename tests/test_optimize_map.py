@@ -190,7 +190,6 @@ def excess(deviations: Floats, covariances: Floats) -> float:
 FLAT = {name: stats.norm(0.0, 1.0) for name in MIRRORED.names}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nuisances", "n"),
     [(Nuisances(), 120), (EVERYTHING, 70), (Nuisances("free", offset=True), 100)],

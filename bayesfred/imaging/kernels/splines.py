@@ -7,8 +7,9 @@ At a point of cell (j, i), where y and x of it have been passed, a spline is
 with B_0 ... B_3 the cubic B-splines of the four coefficients that matter, as polynomials of what is
 passed of the cell. Compilers do not find vectors in such a sum: left to themselves they fetch
 sixteen coefficients one after the other, which takes twice as long. So the sum is written as LLVM's
-instructions. Lines l = 0 ... 3 of a row lie side by side in memory and in a vector. Each of the
-four B_k(y) multiplies such a vector, and their sum is multiplied by the vector B(x) in the end.
+instructions. The coefficients l = 0 ... 3 of a row lie side by side in memory and in a vector. Each
+of the four B_k(y) multiplies such a vector, and their sum is multiplied by the vector B(x) in the
+end.
 """
 
 from collections.abc import Sequence
