@@ -124,6 +124,7 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
 # what costs most to compile is not in the default run
 COSTLY = {
     "gaussian": pytest.mark.slow,
+    "gaussian, curved": pytest.mark.slow,
     "variance image": pytest.mark.slow,
     "free, gaussian": pytest.mark.long,
 }
