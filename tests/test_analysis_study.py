@@ -138,6 +138,7 @@ def test_simulated_background_and_noise() -> None:
     assert np.abs(z).max() < 5.5
 
 
+@pytest.mark.slow
 def test_simulated_fluxes_and_shifts_have_their_priors() -> None:
     """One source, whose centroid scatters as Student's t does, by tau.
 

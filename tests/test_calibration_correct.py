@@ -316,6 +316,7 @@ def test_the_grid_points_where_the_calibration_does() -> None:
 # --- errors ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_calibrations_variance_is_that_of_frames_corrected_with_its_draws() -> None:
     """The draws are those of the calibration, so that there is no Monte Carlo error."""
     calibration = calibration_of((80, 80), radial=0.05, error=0.005, sky=SKY)

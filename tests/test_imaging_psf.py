@@ -349,6 +349,7 @@ def test_second_derivatives_are_those_of_slopes(psf: PSF) -> None:
         assert -p_b[1] == pytest.approx(found[3], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_fisher_is_that_of_the_images(psf: PSF) -> None:
     """With the PSF's width among the parameters."""
     posterior, params = make_posterior(psf, *CASES["scale"], 86)

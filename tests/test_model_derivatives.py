@@ -181,7 +181,10 @@ def full_information(posterior: Posterior, params: Floats, fluxes: Floats | None
     return np.asarray(information)
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if "free" not in case and case != "box"])
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=COSTLY.get(c, ())) for c in CASES if "free" not in c and c != "box"],
+)
 def test_fisher_is_that_of_the_dense_jacobian(case: str) -> None:
     model, nuisances, noise, background = CASES[case]
     rng = np.random.default_rng(21)

@@ -152,6 +152,7 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_scores_of_drawn_frames_have_the_information_as_covariance() -> None:
     rng, model = np.random.default_rng(721), touching(2e4)
     truth = {**make_truth(model, rng, 3.0), "model_error": 0.08}

@@ -168,7 +168,7 @@ def frame(case: str) -> tuple[Posterior, Floats]:
     return make_posterior(model, truth, rng, nuisances, PoissonNoise(read_noise), mask=mask)
 
 
-@pytest.mark.parametrize("case", ["small", "large", "map"])
+@pytest.mark.parametrize("case", ["small", "large", pytest.param("map", marks=pytest.mark.slow)])
 def test_log_prob_is_the_sum_over_all_pixels(case: str) -> None:
     posterior, params = frame(case)
     for factor in (1.0, 1.4, 5.0):  # at the last the pixels are summed one by one

@@ -3,7 +3,7 @@ refits of simulated data."""
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -106,12 +106,19 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     )
 
 
-@pytest.mark.parametrize("case", ["bright", "faint"])
-def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> None:
-    model, tau, background, _ = CASES[case]
-    rng = np.random.default_rng(51)
-    posterior, named = scattered(model, tau, rng, background)
-    params = at_random(posterior, named, rng)
+class Mode(NamedTuple):
+    """A mode of the fluxes and shifts of a frame, from dense images."""
+
+    phi: Floats  # fluxes, then shifts
+    log_likelihood: float  # Laplace's, and the next term
+    slopes: Floats  # of the mean by phi
+    mean: Floats
+    curvature: Floats  # slope of the log prior of the shifts over these
+
+
+def mode(posterior: Posterior, params: Floats, shifts: Floats) -> Mode:
+    """The one above these shifts."""
+    model = posterior.model
     named = dict(zip(posterior.parameter_names, params, strict=True))
     tau, level, n = (
         named["position_scatter"],
@@ -127,17 +134,20 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
             ]
         )
 
+    flux = model.sources.flux
+
+    def phi_of(z: Floats) -> Floats:  # z are some errors
+        return np.append(flux * np.exp(z[:n] / np.sqrt(flux)), tau * z[n:])
+
     def value(z: Floats) -> float:
-        fluxes, shifts = np.exp(z[:n]), tau * z[n:]
+        fluxes, shifts = np.split(phi_of(z), [n])
         student = stats.multivariate_t(shape=tau**2 * np.eye(2), df=DOF)
         prior = student.logpdf(shifts.reshape(-1, 2)).sum()
         stamps = templates(np.concatenate([fluxes, shifts]))
         return float(joint(posterior, stamps, level, fluxes) + prior)
 
-    found = optimize.minimize(
-        lambda z: -value(z), np.append(np.log(model.sources.flux), np.zeros(2 * n)), tol=1e-9
-    )
-    phi = np.append(np.exp(found.x[:n]), tau * found.x[n:])
+    found = optimize.minimize(lambda z: -value(z), np.append(np.zeros(n), shifts / tau), tol=1e-9)
+    phi = phi_of(found.x)
 
     def mean(phi: Floats) -> Floats:
         return phi[:n] @ templates(phi) + level
@@ -145,17 +155,29 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     steps = np.append(1e-3 * phi[:n], np.full(2 * n, 1e-2))
     slopes = np.stack([five_point(mean, phi, k, steps[k]) for k in range(3 * n)])
     square = np.repeat(np.sum(phi[n:].reshape(n, 2) ** 2, axis=1), 2)
-    curvature = (DOF + 2) / (DOF * tau**2 + square)  # slope of log prior over the shift
+    curvature = (DOF + 2) / (DOF * tau**2 + square)
     h = (slopes * posterior.counts.ravel() / mean(phi) ** 2) @ slopes.T + np.diag(
         np.append(2 * phi[:n] ** -2, DOF / (DOF + 2) * curvature)
     )
     expected = value(found.x) + 1.5 * n * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(h)[1]
-    expected -= found.x[:n].sum()  # the density is that of log F, H that in F
+    expected -= np.log(phi[:n]).sum()  # the density is that of log F, H that in F
     stamps, at = templates(phi), mean(phi)
     counts = posterior.counts.ravel()
     expected += next_term(
         (phi[:n, None] * stamps)[posterior.likelihood._faint], counts / at**2, counts / at**3, 2.0
     )
+    return Mode(phi, float(expected), slopes, at, curvature)
+
+
+@pytest.mark.parametrize("case", ["bright", "faint"])
+def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> None:
+    model, tau, background, _ = CASES[case]
+    rng = np.random.default_rng(51)
+    posterior, named = scattered(model, tau, rng, background)
+    params = at_random(posterior, named, rng)
+    n = len(model.sources)
+    phi, expected, slopes, at, curvature = mode(posterior, params, np.zeros(2 * n))
+    tau = dict(zip(posterior.parameter_names, params, strict=True))["position_scatter"]
     assert posterior.fluxes(params) == pytest.approx(phi[:n], rel=1e-4)
     assert posterior.log_prob(params) - posterior.log_prior(params)[0] == pytest.approx(
         expected, abs=1e-5
@@ -177,7 +199,7 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
         )
 
     outer = np.stack([five_point(image, params, i, STEP * scale[i]) for i in others])
-    weight = 1 / mean(phi)
+    weight = 1 / at
     inner = (slopes * weight) @ slopes.T
     known_shifts = (DOF + 2) / (DOF + 4) * curvature
     h = inner + np.diag(np.append(2 * phi[:n] ** -2, known_shifts))
@@ -197,6 +219,32 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
         share = 2 * DOF / (DOF + 4) / tau**2
         assert fisher[k, k] == pytest.approx(np.sum(share / (1 + left) ** 2), rel=0.01)
     assert not fisher[k, others].any()
+
+
+def test_of_two_modes_of_a_shift_the_higher_counts() -> None:
+    """A source far off, as its counts tell, has one near the catalogue and one near its image.
+
+    Which is higher changes with the scatter. Without the other one, log_prob would fall there.
+    """
+    model = make_model(
+        SourceCatalog([-9.0, 8.0], [-4.0, 3.0], [2e3, 8e3]), sigma=2.0, detector=Detector((32, 44))
+    )
+    rng = np.random.default_rng(53)
+    named = known({**make_truth(model, rng, 3.0), "position_scatter": 0.01}, SCATTER)
+    shifts = np.array([[0.25, -0.15], [0.0, 0.0]])
+    images = [f * shifted_image(model, named, s, shifts[s]) for s, f in enumerate((2e3, 8e3))]
+    mean = np.sum(images, axis=0) + background_image((32, 44), named)
+    posterior = Posterior(model, rng.poisson(mean), nuisances=SCATTER)
+    gains = []
+    for tau in np.geomspace(5e-4, 0.02, 10):
+        named["position_scatter"] = tau
+        params = np.array([named[name] for name in posterior.parameter_names])
+        modes = [mode(posterior, params, start.ravel()) for start in (0.0 * shifts, shifts)]
+        values = [each.log_likelihood for each in modes]
+        value = posterior.log_prob(params) - posterior.log_prior(params)[0]
+        assert value == pytest.approx(max(values), abs=1e-4)
+        gains.append(values[1] - values[0])
+    assert min(gains) < -1.0 and max(gains) > 1.0
 
 
 def test_scatter_is_outside_the_support_below_zero_and_needs_free_fluxes() -> None:

@@ -180,7 +180,11 @@ def donut():
 
 @pytest.mark.parametrize(
     ("psf", "fwhm"),
-    [(bf.GaussianPSF(0.5), 1.18), (bf.MoffatPSF(3.0, 4.765), 3.0), (donut(), 5.0)],
+    [
+        pytest.param(bf.GaussianPSF(0.5), 1.18, marks=pytest.mark.slow),
+        (bf.MoffatPSF(3.0, 4.765), 3.0),
+        (donut(), 5.0),
+    ],
     ids=["undersampled Gaussian", "Moffat", "donut"],
 )
 def test_a_known_psf_is_recovered_to_its_errors(psf, fwhm):
@@ -246,6 +250,7 @@ def test_errors_of_the_psf_are_those_of_a_joint_fit():
     assert np.all(widening > 1.02) and widening.max() > 1.2
 
 
+@pytest.mark.slow
 def test_conventions_of_volume_and_centroid():
     _, _, posterior = frame_of(bf.MoffatPSF(3.0, 4.765), 3.0, side=5)
     estimate = bf.find_map(posterior)
@@ -338,6 +343,7 @@ def varying_model(rng):
     return bf.ForwardModel(bf.Detector((31, 33)), sources, psf, d, tolerance=0.0), [1e-3, -2e-3]
 
 
+@pytest.mark.slow
 def test_a_psf_that_varies_over_the_field_is_rendered_as_its_definition_says():
     model, theta = varying_model(np.random.default_rng(4))
     d, s, psf = model.distortion, model.sources, model.psf

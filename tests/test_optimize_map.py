@@ -192,7 +192,11 @@ FLAT = {name: stats.norm(0.0, 1.0) for name in MIRRORED.names}
 
 @pytest.mark.parametrize(
     ("nuisances", "n"),
-    [(Nuisances(), 120), (EVERYTHING, 70), (Nuisances("free", offset=True), 100)],
+    [
+        (Nuisances(), 120),
+        (EVERYTHING, 70),
+        pytest.param(Nuisances("free", offset=True), 100, marks=pytest.mark.slow),
+    ],
     ids=["fixed", "all", "free"],
 )
 def test_refits_scatter_as_the_covariance_says(nuisances: Nuisances, n: int) -> None:
@@ -275,6 +279,7 @@ def test_map_and_variance_of_the_background_are_those_of_a_grid() -> None:
     assert best.covariance[1, 1] == pytest.approx(variance, rel=0.03)
 
 
+@pytest.mark.slow
 def test_map_of_the_papers_noise_is_its_least_squares() -> None:
     rng = np.random.default_rng(33)
     model = make_model()

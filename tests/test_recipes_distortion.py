@@ -168,6 +168,7 @@ def test_the_maximum_and_its_errors_are_the_same(
     assert (float(f), float(g)) == pytest.approx((float(f_plain), float(g_plain)), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_free_fluxes_are_profiled_alike(counts: Floats) -> None:
     """`near` extrapolates fluxes in theta, whatever its basis."""
     nuisances = bf.Nuisances("free")

@@ -133,6 +133,7 @@ def test_log_prob_is_that_of_the_dense_image() -> None:
     assert value == pytest.approx(float(terms.sum()), abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", NAMES)
 def test_it_agrees_with_the_packages_own(case: str) -> None:
     posterior, params = made(case)
@@ -192,6 +193,7 @@ def test_extrapolated_fluxes_are_those_that_are_searched_for() -> None:
     assert np.mean(near.log_prob(draws) != searched) > 0.5
 
 
+@pytest.mark.slow
 def test_scores_of_drawn_frames_have_the_information_as_covariance() -> None:
     rng = np.random.default_rng(194)
     model = make_model(TOUCHING, sigma=2.0, tolerance=1e-10)

@@ -197,6 +197,7 @@ def test_fit_finds_the_truth_which_a_circular_one_does_not_explain() -> None:
     assert wrong.log_prob < best.log_prob - 1000.0
 
 
+@pytest.mark.slow
 def test_it_is_sampled_stored_and_read_back(tmp_path: Path) -> None:
     serialize.serializable("psf.elliptical")(EllipticalPSF)
     posterior, _ = made(Nuisances("scale"))

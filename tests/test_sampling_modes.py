@@ -41,6 +41,7 @@ def fine_grid() -> np.ndarray:
     return np.arange(-4.5 * REACH, 4.5 * REACH, 0.005)
 
 
+@pytest.mark.slow
 def test_draws_of_a_mask_are_those_of_the_grid() -> None:
     posterior = multimodal.masked(1, 3.0)
     estimate = find_map(posterior)

@@ -60,10 +60,14 @@ from bayesfred.model.kernels.clusters import (
 )
 from bayesfred.model.kernels.contexts import Group, Touching
 from bayesfred.model.kernels.expansion import Pixels, expand
-from bayesfred.model.kernels.noise_dispatch import exact_weight, given
+from bayesfred.model.kernels.likelihood import slope_run, stretch
+from bayesfred.model.kernels.noise_dispatch import exact_weight, given, sum_pixels
 from bayesfred.model.kernels.patches import Patch, fill_excess, new_patch, weigh_patch
+from bayesfred.model.kernels.shift_modes import other_mode
 
 LONGEST = 8.0  # Newton steps in one
+TRIES = 4  # other modes that are looked at in a cluster
+TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
 
 
 class _Cluster(NamedTuple):
@@ -180,6 +184,19 @@ def _relative(cluster, step, i):
     return largest
 
 
+@inner()
+def _change(cluster, s, flux, dx, dy):
+    """Change a source's flux and shift."""
+    fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
+    add_template(fp, s, stamps[0], -fluxes[s], cluster.canvas)
+    fluxes[s] += flux
+    cluster.shifts[s, 0] += dx
+    cluster.shifts[s, 1] += dy
+    move(cluster.layout.optics, cluster.layout.geometry, s, dx, dy)
+    _make_templates(cluster, s, fluxes[s])
+    add_template(fp, s, stamps[0], fluxes[s], cluster.canvas)
+
+
 @inner(error_model="numpy")
 def _take_step(cluster, step, shares, together):
     """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`.
@@ -198,13 +215,7 @@ def _take_step(cluster, step, shares, together):
     for i in range(members.size):
         s, own = members[i], shares[i] * step[i * size : (i + 1) * size]
         if size > 1:
-            add_template(fp, s, stamps[0], -fluxes[s], cluster.canvas)
-            fluxes[s] += own[0]
-            cluster.shifts[s, 0] += own[1]
-            cluster.shifts[s, 1] += own[2]
-            move(cluster.layout.optics, cluster.layout.geometry, s, own[1], own[2])
-            _make_templates(cluster, s, fluxes[s])
-            add_template(fp, s, stamps[0], fluxes[s], cluster.canvas)
+            _change(cluster, s, own[0], own[1], own[2])
         else:
             fluxes[s] += own[0]
             add_template(fp, s, stamps[0], own[0], cluster.canvas)
@@ -267,6 +278,88 @@ def _maximize(frame, parameters, cluster, h):
     return False
 
 
+@inner(fastmath=REDUCE, error_model="numpy")
+def _known(cluster, s):
+    """What the pixels tell of a source's shift along itself, its flux unknown."""
+    fp, stamps, at = cluster.layout.footprints, cluster.touching.stamps, cluster.canvas.at
+    weight, (dx, dy) = cluster.patch.weight, cluster.shifts[s]
+    own, cross, along = 1e-300, 0.0, 0.0
+    for p in range(fp.first[s], fp.first[s + 1]):
+        first = fp.start[p]
+        for k in range(fp.size[p]):
+            w, unit = weight[at[p] + k], stamps[0, first + k]
+            slope = stamps[1, first + k] * dx + stamps[2, first + k] * dy
+            own += w * unit * unit
+            cross += w * unit * slope
+            along += w * slope * slope
+    return (along - cross * cross / own) / (dx * dx + dy * dy)
+
+
+@inner(error_model="numpy")
+def _log_density(frame, parameters, cluster, h):
+    """What the log-density of a cluster's mode and its width say, up to constants."""
+    patch, noise, value = cluster.patch, given(frame.noise, parameters), 0.0
+    for j in range(patch.first.size):
+        a, b, first = patch.start[j], patch.start[j + 1], patch.first[j]
+        image = patch.image[a:b]
+        part = stretch(frame, parameters.background, patch.top + j, first, image)
+        slope_run(part, patch.score[a:b])
+        value += sum_pixels(noise, part.values, image, patch.score[a:b], part.c0, first)
+    return value + _log_prior(cluster, h)
+
+
+@inner(error_model="numpy")
+def _log_prior(cluster, h):
+    """Of a cluster's fluxes and shifts, less half the logarithm of H's determinant."""
+    prior, start, value = cluster.prior, cluster.group.start, 0.0
+    constant = 0.5 * math.log(2.0 * math.pi) - math.lgamma(prior.shape)
+    for i in range(start.size):
+        value -= math.log(h[start[i] + i])
+    for s in cluster.group.members:
+        scale, flux = cluster.scale[s], cluster.fluxes[s]
+        value += (prior.shape - 1.0) * math.log(flux / scale) - flux / scale
+        value += constant - math.log(scale)
+        if prior.scatter > 0.0:
+            ratio, _ = shift_prior(cluster.shifts[s], prior.scatter)
+            value -= (0.5 * DOF + 1.0) * math.log1p(ratio) + 2.0 * math.log(prior.scatter)
+    return value
+
+
+@inner(error_model="numpy")
+def _climb(frame, parameters, cluster, h):
+    """The same for the highest mode: a shift may have two, see `shift_modes.py`."""
+    found = _maximize(frame, parameters, cluster, h)
+    if not found or cluster.touching.stamps.shape[0] == 1:
+        return found
+    members, fluxes, shifts = cluster.group.members, cluster.fluxes, cluster.shifts
+    gains, ratios = np.empty(members.size), np.empty(members.size)
+    for i in range(members.size):
+        known, shift = _known(cluster, members[i]), math.sqrt(np.sum(shifts[members[i]] ** 2))
+        gains[i], ratios[i] = other_mode(shift, known, cluster.prior.scatter, cluster.layout.sigma)
+    value, factor = math.nan, np.empty(0)
+    for _ in range(TRIES):
+        i = gains.argmax()
+        if gains[i] < TIE:
+            break
+        if factor.size == 0:
+            value, factor = _log_density(frame, parameters, cluster, h), np.empty(h.size)
+        gains[i] = -math.inf
+        old_fluxes, old_shifts = fluxes[members], shifts[members]
+        dx, dy = (ratios[i] - 1.0) * old_shifts[i]
+        _change(cluster, members[i], 0.0, dx, dy)
+        if _maximize(frame, parameters, cluster, factor):
+            there = _log_density(frame, parameters, cluster, factor)
+            if there > value:
+                value = there
+                copy(factor, h)
+                continue
+        for j in range(members.size):
+            s = members[j]
+            back_x, back_y = old_shifts[j] - shifts[s]
+            _change(cluster, s, old_fluxes[j] - fluxes[s], back_x, back_y)
+    return True
+
+
 @shared(error_model="numpy")
 def profile(problem, layout, w, parameters, profiled, fluxes):
     """Fill the fluxes and `profiled` with their maximum; add the sources to the image.
@@ -279,7 +372,6 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
     at, frame = np.empty(fp.row.size, np.int64), row_starts(fp, w.image.size // w.span.shape[0])
     shape, scatter = problem.shape, parameters.nuisances.position_scatter
     scale, value = problem.flux / shape, 0.0
-    constant = 0.5 * math.log(2.0 * math.pi) - math.lgamma(shape)
     shifts[:] = 0.0
     for c in range(clusters.first.size - 1):
         group = one_cluster(clusters, c, size)
@@ -291,20 +383,14 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
         )
         fill_excess(problem.frame, parameters.background, patch)
         _start(cluster)
-        if not _maximize(problem.frame, parameters, cluster, h):
+        if not _climb(problem.frame, parameters, cluster, h):
             return -math.inf
         if np.any(touching.faint[group.members]):
             noise = given(problem.frame.noise, parameters)
             weigh_patch(problem.frame, noise, parameters.background, patch, patch.ratio)
             pixels = Pixels(patch.weight, patch.ratio, at)
             value += expand(touching, group, fluxes, shape, pixels)[0]
-        for i in range(group.lead.size):
-            value -= math.log(h[group.start[i] + i])
+        value += _log_prior(cluster, h)
         for s in group.members:
-            value += (shape - 1.0) * math.log(fluxes[s] / scale[s]) - fluxes[s] / scale[s]
-            value += constant - math.log(scale[s])
-            if size > 1:
-                ratio, _ = shift_prior(shifts[s], scatter)
-                value -= (0.5 * DOF + 1.0) * math.log1p(ratio) + 2.0 * math.log(scatter)
             add_template(fp, s, touching.stamps[0], fluxes[s], Canvas(w.image, frame))
     return value

@@ -196,8 +196,8 @@ def weigh_rows(frame, noise, w, background, rows, ratios):
         _weigh_rows(frame, noise, w, background, rows, None)
 
 
-@inner(fastmath=FAST)
-def _slope_run(part, out):
+@shared(fastmath=FAST)
+def slope_run(part, out):
     """The image of a stretch plus the part of the background that varies along it."""
     for i in range(out.size):
         x = part.u + part.step * i
@@ -236,7 +236,7 @@ def log_likelihood(frame, w, parameters):
             if frame.varies:
                 part = stretch(frame, background, j, a, light)
                 level, image = part.c0, w.score[a:b]
-                _slope_run(part, image)
+                slope_run(part, image)
             total += summed(noise, frame.values[a:b], light, image, level, a)
             start, stop = next_run(w, j, stop)
     rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
