@@ -35,6 +35,7 @@ class Optics(NamedTuple):
     support_radius: float  # (a, b) that lie farther from 0 are below the tolerance, sigma
     ramp: Floats  # (padded row,) u of pixels counted from a row's first
     degrees: Degrees
+    translates: bool  # whether every source's map is a translation: f and g without u and v
 
 
 class SourceNuisances(NamedTuple):

@@ -20,6 +20,12 @@ from bayesfred.imaging.kernels.geometry import (
     one_source,
 )
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
+from bayesfred.imaging.kernels.products import (
+    are_products,
+    fill_second_derivatives,
+    lines_of,
+    product_basis_row,
+)
 from bayesfred.imaging.kernels.psf_dispatch import (
     psf_of_source,
     psf_second_derivatives,
@@ -305,21 +311,57 @@ def basis_row(rows, source, u_row, v_row, n, template):
 
 
 @shared(fastmath=FAST)
+def second_derivatives(layout, rows, s, flux):
+    """Flux times K_xx, K_xy and K_yy of source s in the pixels of its footprint, shape (3, pixels).
+
+    `rows` are those of a basis with the monomial 1 alone.
+    """
+    o, fp, grid, out = layout.optics, layout.footprints, pixel_grid(layout), rows.out
+    first, last = fp.first[s], fp.first[s + 1]
+    source, begin = one_source(layout.geometry, s), fp.start[first]
+    second = np.empty((3, fp.start[last] - begin))
+    if are_products(o.psf, o):
+        fill_second_derivatives(lines_of(o.psf, layout, s, first, last), fp, s, flux, second)
+        return second
+    for p in range(first, last):
+        n, own = fp.size[p], fp.start[p] - begin
+        u = (fp.low[p] - grid.middle_u) * grid.step
+        v = (fp.row[p] - grid.middle_v) * grid.step
+        basis_row(rows, source, u, v, n, np.int64(1))
+        for k in range(n):
+            second[0, own + k], second[1, own + k] = -flux * out[0, k], -flux * out[1, k]
+        basis_row(rows, source, u, v, n, np.int64(2))
+        for k in range(n):
+            second[2, own + k] = -flux * out[1, k]
+    return second
+
+
+@shared(fastmath=FAST)
 def add_jacobian_rows(layout, basis, flux, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
     rows, fp, grid = new_rows(layout, basis, out.shape[2]), layout.footprints, pixel_grid(layout)
     begins, lows, sizes, numbers = fp.first, fp.low, fp.size, fp.row
     factors, index, basis_rows, reached = basis.factors, basis.row, rows.out, layout.geometry.rows
+    o, inverse, monomials = (
+        layout.optics,
+        1.0 / layout.sigma,
+        (len(rows.f), len(rows.g), rows.is_wider),
+    )
+    products = are_products(o.psf, o)
     for s in range(flux.size):
         if reached[s, 0] >= last or reached[s, 1] <= first:
             continue
         source = one_source(layout.geometry, s)
+        lines = lines_of(o.psf, layout, s, begins[s], begins[s + 1] if products else begins[s])
         for p in range(begins[s], begins[s + 1]):
             j, low, n = numbers[p], lows[p], sizes[p]
             if not first <= j < last:
                 continue
-            u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
-            basis_row(rows, source, u, v, n, np.int64(0))
+            if products:
+                product_basis_row(lines, monomials, inverse, j, low, basis_rows[:, :n])
+            else:
+                u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
+                basis_row(rows, source, u, v, n, np.int64(0))
             for k in range(index.size):
                 c = flux[s] * factors[s, k]
                 if c != 0.0:

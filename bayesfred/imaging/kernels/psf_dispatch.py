@@ -14,6 +14,10 @@ polynomial on a row of pixels:
     radial_scale(psf)                c
     radial(psf, z)                   p where z = c (a^2 + b^2)
 
+One that is a product, p = f(a) f(b), is faster where the map is a translation with one more:
+
+    line(psf, a)                     f, -f', f''
+
 One that has to look something up does so for all pixels of a row at once, and needs no `value`:
 
     new_places(psf, width)              room for a row's places in the table
@@ -52,6 +56,7 @@ def by_type(choice: Callable[[Any], Callable[..., Any]]) -> Callable[..., Any]:
 psf_value = by_type(lambda family: family.value)
 psf_slopes = by_type(lambda family: family.slopes)
 psf_second_derivatives = by_type(lambda family: family.second_derivatives)
+psf_line = by_type(lambda family: family.line)
 _radial_scale = by_type(lambda family: family.radial_scale)
 _radial = by_type(lambda family: family.radial)
 

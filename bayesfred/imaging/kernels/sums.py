@@ -23,6 +23,7 @@ from bayesfred.imaging.kernels.jacobian import (
     widens,
 )
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
+from bayesfred.imaging.kernels.products import are_products, lines_of, product_sums
 
 
 class Sums(NamedTuple):
@@ -169,6 +170,15 @@ def add_basis_sums(layout, basis, s, template, weight, buffers):
     sums, out, degrees = buffers.sums, buffers.out, layout.optics.degrees
     source, first = one_source(layout.geometry, s), layout.footprints.first
     a, b, n_f, n_g = source.a, source.b, basis.f.shape[0], basis.g.shape[0]
+    if are_products(layout.optics.psf, layout.optics):
+        lines = lines_of(layout.optics.psf, layout, s, first[s], first[s + 1])
+        flux, by_a, by_b, wide = product_sums(lines, layout.footprints, s, template, weight)
+        out[:n_f] += by_a
+        out[n_f : n_f + n_g] += by_b
+        out[n_f + n_g] += flux
+        if widens(basis):
+            out[n_f + n_g + 1] -= ((2.0 if template == 0 else 3.0) * flux + wide) / layout.sigma
+        return
     flux = _sample_sums(layout, source, (first[s], first[s + 1]), template, weight, buffers)
     out[n_f + n_g] += flux
     if widens(basis):

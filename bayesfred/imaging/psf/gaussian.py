@@ -27,6 +27,11 @@ class GaussianProfile(NamedTuple):
         return exp2(z)
 
     @staticmethod
+    def line(psf: Any, a: Any) -> Any:
+        f = exp2(-0.5 * LOG2_E * a * a)
+        return f, a * f, a * a * f - f
+
+    @staticmethod
     def slopes(psf: Any, a: Any, b: Any) -> Any:
         p = exp2(-0.5 * LOG2_E * (a * a + b * b))
         return p, a * p, b * p

@@ -42,9 +42,9 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Geometry, Layout
-from bayesfred.imaging.kernels.geometry import new_work, one_source, row_starts
-from bayesfred.imaging.kernels.jacobian import PixelGrid, Rows, basis_row, new_rows, pixel_grid
+from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Layout
+from bayesfred.imaging.kernels.geometry import new_work, row_starts
+from bayesfred.imaging.kernels.jacobian import Rows, new_rows, second_derivatives
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.clusters import (
     DOF,
@@ -93,8 +93,7 @@ class _Amplitudes(NamedTuple):
 class _Adjoint(NamedTuple):
     """What the derivative of the Laplace term is made of."""
 
-    geometry: Geometry
-    grid: PixelGrid
+    layout: Layout
     touching: Touching
     fluxes: Floats
     score: Floats
@@ -155,33 +154,21 @@ def _mix(adjoint, group, lower):
 def _second_derivatives(adjoint, group, i, part, g):
     """Add what a source's K_xx, K_xy, K_yy, and X, Y as dK, give to its rows of e and G."""
     fp, stamps, mixed = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.mixed
-    rows, s, ats, score, weights = (
-        adjoint.rows,
-        group.members[i],
-        adjoint.at,
-        adjoint.score,
-        adjoint.weight,
-    )
-    out, grid, source = rows.out, adjoint.grid, one_source(adjoint.geometry, s)
-    starts, lows, sizes, numbers = fp.start, fp.low, fp.size, fp.row
-    flux, pitch = adjoint.fluxes[s], out.shape[1]
-    xx, xy = np.empty(pitch), np.empty(pitch)
+    ats, score, weights, s = adjoint.at, adjoint.score, adjoint.weight, group.members[i]
+    starts, sizes, flux = fp.start, fp.size, adjoint.fluxes[s]
+    second = second_derivatives(adjoint.layout, adjoint.rows, s, flux)
     for p in range(fp.first[s], fp.first[s + 1]):
-        n = sizes[p]
-        u, v = (lows[p] - grid.middle_u) * grid.step, (numbers[p] - grid.middle_v) * grid.step
-        basis_row(rows, source, u, v, n, np.int64(1))
-        for k in range(n):
-            xx[k], xy[k] = -flux * out[0, k], -flux * out[1, k]
-        basis_row(rows, source, u, v, n, np.int64(2))
-        for k in range(n):
-            at, pixel, yy = starts[p] + k, ats[p] + k, -flux * out[1, k]
+        begin = starts[p] - starts[fp.first[s]]
+        for k in range(sizes[p]):
+            at, pixel, own = starts[p] + k, ats[p] + k, begin + k
+            xx, xy, yy = second[0, own], second[1, own], second[2, own]
             x, y = stamps[1, at] / flux, stamps[2, at] / flux
             r, weight = score[pixel], weights[pixel]
             q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
             part[0] -= weight * (q1 * x + q2 * y)
-            part[1] -= weight * (q0 * x + q1 * xx[k] + q2 * xy[k])
-            part[2] -= weight * (q0 * y + q1 * xy[k] + q2 * yy)
-            add_block(i, group.start, g, (-r * x, -r * y, -r * xx[k], -r * xy[k], -r * yy))
+            part[1] -= weight * (q0 * x + q1 * xx + q2 * xy)
+            part[2] -= weight * (q0 * y + q1 * xy + q2 * yy)
+            add_block(i, group.start, g, (-r * x, -r * y, -r * xx, -r * xy, -r * yy))
 
 
 @inner()
@@ -236,11 +223,9 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
     h, y, z = np.zeros(w.image.size), np.zeros(w.image.size), np.empty((flux.size, size))
     at, mixed = row_starts(fp, pitch), np.zeros(stamps.shape)
     rows = new_rows(layout, _constants(), pitch)
-    grid, light = pixel_grid(layout), np.zeros(stamps.shape[1])
+    light = np.zeros(stamps.shape[1])
     curve = w.weight if response.size == 0 else response
-    adjoint = _Adjoint(
-        layout.geometry, grid, touching, flux, w.score, w.weight, curve, at, mixed, light, rows
-    )
+    adjoint = _Adjoint(layout, touching, flux, w.score, w.weight, curve, at, mixed, light, rows)
     prior = Prior(shape, scatter if size > 1 else 0.0)
     slope = 0.0
     for c in range(clusters.first.size - 1):
