@@ -18,11 +18,11 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFFile, PSFToMeasure, has_pixel
 from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
-from bayesfred.joint_settings import JointRun
 from bayesfred.model import priors
 from bayesfred.model.noise import Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
-from bayesfred.simulation_sections import SimulationSettings
+from bayesfred.settings.joint import JointRun
+from bayesfred.settings.simulation import SimulationSettings
 from bayesfred.sources import find_sources
 
 SECTIONS = ("frame", "catalogue", "psf", "noise")  # that may name a file

@@ -1,4 +1,4 @@
-"""The command line: options in, results printed, exit codes out. The work is in `commands.py`.
+"""The command line: options in, results printed, exit codes out. The work is in `commands`.
 
 Exit codes: 0 done and trustworthy; 2 bad input (one line, no traceback); 3 finished, but not
 sampled well, or the model does not fit the counts, or a check does not hold; 130 interrupted or
@@ -49,7 +49,8 @@ Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the ou
 
 def _example() -> str:
     """The example run file, marked paragraph by paragraph so that the help keeps its lines."""
-    text = resources.files("bayesfred").joinpath("example.toml").read_text(encoding="utf-8")
+    example = resources.files("bayesfred") / "settings" / "example.toml"
+    text = example.read_text(encoding="utf-8")
     return "\n\n".join("\b\n" + paragraph for paragraph in text.strip().split("\n\n"))
 
 

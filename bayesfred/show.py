@@ -1,6 +1,6 @@
 """What commands found, printed: tables first, then files, and the verdict in the last line.
 
-Every function prints the record of a function in `commands.py` and returns whether all is well.
+Every function prints the record of a function in `commands` and returns whether all is well.
 """
 
 import json
@@ -16,10 +16,8 @@ from rich.console import Console
 
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.verify import Verification
-from bayesfred.errors import printable
-from bayesfred.io.summary_table import Table
-from bayesfred.proposal import Proposed
-from bayesfred.records import (
+from bayesfred.commands.proposal import Proposed
+from bayesfred.commands.records import (
     Calibrated,
     Compared,
     Corrected,
@@ -29,6 +27,8 @@ from bayesfred.records import (
     Simulated,
     Study,
 )
+from bayesfred.errors import printable
+from bayesfred.io.summary_table import Table
 from bayesfred.reporting import screen
 
 MOST_NAMED = 20  # parameters in a line

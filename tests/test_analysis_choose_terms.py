@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from bayesfred import commands, pipeline
+from bayesfred import commands
 from bayesfred.analysis import choose_terms as module
 from bayesfred.analysis.choose_terms import TermChoice, choose_terms
 from bayesfred.analysis.folds import fold_sources
+from bayesfred.commands import pipeline
 from bayesfred.errors import InputError
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
@@ -26,7 +27,7 @@ from bayesfred.model.noise import GaussianNoise, simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map
-from bayesfred.settings import read_settings
+from bayesfred.settings.run import read_settings
 
 Floats = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ import bayesfred as bf
 from bayesfred.cli import app
 from bayesfred.errors import InputError
 from bayesfred.sampling.chainfile import open_chain
-from bayesfred.settings import read_settings
+from bayesfred.settings.run import read_settings
 
 # a picture of one pixel: rendering real ones takes most of the time of a small run
 DOT = bytes.fromhex(

@@ -34,6 +34,7 @@ import bayesfred
 from bayesfred import build
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.cli import app
+from bayesfred.commands.pipeline import read_frame
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
@@ -41,15 +42,14 @@ from bayesfred.io import catalogues, frames
 from bayesfred.io.hdf5_checks import seal
 from bayesfred.io.tables import read_table
 from bayesfred.model.posterior import Posterior
-from bayesfred.pipeline import read_frame
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import fingerprint, open_chain
-from bayesfred.settings import RunSettings, read_settings
+from bayesfred.settings.run import RunSettings, read_settings
 from bayesfred.sources import STRAY
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BAYESFRED_DATA") or Path(__file__).parents[2] / "shared" / "data")
-EXAMPLE = Path(bayesfred.__file__).with_name("example.toml")
+EXAMPLE = Path(bayesfred.__file__).parent / "settings" / "example.toml"
 
 TRUTH = {"f_ux": 2e-4, "f_ux2": 5e-6, "g_vy": -3e-4}
 BACKGROUND = 3.0

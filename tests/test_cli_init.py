@@ -11,7 +11,7 @@ from test_analysis_photon_transfer import GAIN, NOISE, PEDESTAL, ZERO, scene, st
 from typer.testing import CliRunner
 
 from bayesfred.cli import app
-from bayesfred.settings import read_settings
+from bayesfred.settings.run import read_settings
 
 
 def invoke(*arguments: Any) -> tuple[int, str, str]:

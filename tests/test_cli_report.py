@@ -17,8 +17,8 @@ from bayesfred.cli import app
 from bayesfred.errors import InputError
 from bayesfred.sampling.chainfile import open_chain, write_chain
 from bayesfred.sampling.record import RunRecord
-from bayesfred.sections import toml
-from bayesfred.settings import read_settings
+from bayesfred.settings.run import read_settings
+from bayesfred.settings.sections import toml
 
 RUN = """
 [frame]

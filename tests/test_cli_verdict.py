@@ -32,7 +32,7 @@ footprint = 8.0
 
 def test_outputs_agree(tmp_path: Path) -> None:
     """Terminal, page, table and record; of a frame with a fault, fitted without sampling."""
-    example = (ROOT / "bayesfred" / "example.toml").read_text()
+    example = (ROOT / "bayesfred" / "settings" / "example.toml").read_text()
     example = example.replace("shape = [505, 505]", "shape = [161, 161]").replace(
         "side = 9", "side = 5"
     )

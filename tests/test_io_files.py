@@ -24,7 +24,7 @@ from bayesfred.io.lock import only_writer
 from bayesfred.io.paths import may_write
 from bayesfred.io.tables import read_table
 from bayesfred.sampling.chainfile import open_chain
-from bayesfred.settings import read_settings
+from bayesfred.settings.run import read_settings
 
 COUNTS = np.arange(35.0).reshape(5, 7)
 FRAME_SUFFIXES = [".fits", ".fit", ".FTS", ".fits.gz", ".fits.fz", ".h5", ".hdf5", ".npy"]

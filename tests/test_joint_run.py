@@ -20,15 +20,15 @@ import pytest
 from test_cli import Output, assert_refused, invoke, snapshot
 
 import bayesfred as bf
-from bayesfred import joint_pipeline, pipeline
 from bayesfred.analysis.frame_agreement import frame_agreement
 from bayesfred.analysis.frame_estimates import frame_estimates
+from bayesfred.commands import joint_pipeline, pipeline
+from bayesfred.commands.joint_pipeline import files_beside
+from bayesfred.commands.results import How, Job, make_chain
 from bayesfred.io.tables import read_table
-from bayesfred.joint_pipeline import files_beside
-from bayesfred.joint_settings import JointRun, read_run
-from bayesfred.results import How, Job, make_chain
-from bayesfred.sections import toml
-from bayesfred.settings import read_settings
+from bayesfred.settings.joint import JointRun, read_run
+from bayesfred.settings.run import read_settings
+from bayesfred.settings.sections import toml
 
 pytestmark = pytest.mark.slow
 

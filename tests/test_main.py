@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from test_cli import environment
 
-EXAMPLE = Path(__file__).parents[1] / "bayesfred" / "example.toml"
+EXAMPLE = Path(__file__).parents[1] / "bayesfred" / "settings" / "example.toml"
 
 # Interrupt where a module is looked for, or where Python lets no exception through
 IMPORTING = """

@@ -12,9 +12,9 @@ from scipy import stats
 from test_pipeline_frames import GAIN, RUN, write
 
 import bayesfred as bf
-from bayesfred import pipeline
+from bayesfred.commands import pipeline
 from bayesfred.optimize.find_map import approach
-from bayesfred.settings import read_settings
+from bayesfred.settings.run import read_settings
 
 Floats = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ import pytest
 from astropy.io import fits
 
 import bayesfred as bf
-from bayesfred import pipeline
-from bayesfred.settings import read_settings
+from bayesfred.commands import pipeline
+from bayesfred.settings.run import read_settings
 
 RUN = """
 [frame]

@@ -19,7 +19,7 @@ import bayesfred as bf
 from bayesfred.analysis.comparison import Comparison, Score
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.analysis.extra_parameters import ExtraParameters
-from bayesfred.joint_pipeline import write_joint_results
+from bayesfred.commands.joint_pipeline import write_joint_results
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.sampling.record import RunRecord

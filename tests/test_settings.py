@@ -16,9 +16,9 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.io.paths import resolve, within
 from bayesfred.io.serialize import kinds, serializable
-from bayesfred.joint_settings import DriftSettings, JointSettings
-from bayesfred.sections import model_of
-from bayesfred.settings import PriorSettings, RunSettings, read_settings
+from bayesfred.settings.joint import DriftSettings, JointSettings
+from bayesfred.settings.run import PriorSettings, RunSettings, read_settings
+from bayesfred.settings.sections import model_of
 
 EXAMPLE = Path(settings.__file__).with_name("example.toml").read_text(encoding="utf-8")
 

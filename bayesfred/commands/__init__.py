@@ -8,7 +8,7 @@ from bayesfred.commands.calibrating import calibration, correct
 from bayesfred.commands.fitting import demo, fit, report, simulate_frame
 from bayesfred.commands.judging import compare, crosscheck, study, verify
 from bayesfred.commands.planning import design
-from bayesfred.proposal import init
+from bayesfred.commands.proposal import init
 
 __all__ = [
     "calibration",

@@ -17,14 +17,14 @@ from bayesfred.calibration.opencv import opencv_camera, write_opencv
 from bayesfred.calibration.plate import Truncation
 from bayesfred.calibration.regions import write_regions
 from bayesfred.calibration.wcs import sip, tpv
+from bayesfred.commands.records import Calibrated, Corrected
+from bayesfred.commands.results import Say
 from bayesfred.errors import InputError, printable
 from bayesfred.io import atomic, outputs, paths
 from bayesfred.io.frames import read_frame
 from bayesfred.model.joint import JointPosterior
-from bayesfred.records import Calibrated, Corrected
 from bayesfred.reporting.calibration import STEPS, calibration_plot
 from bayesfred.reporting.style import png
-from bayesfred.results import Say
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.progress import working

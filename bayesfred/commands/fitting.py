@@ -5,21 +5,22 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from bayesfred import build, joint_pipeline, pipeline, settings
+from bayesfred import build, settings
 from bayesfred._typing import PathLike
 from bayesfred.analysis.dask_cluster import DaskWorkers, cluster
 from bayesfred.analysis.photons import photons_needed
 from bayesfred.analysis.processes import Processes, processes
+from bayesfred.commands import joint_pipeline, pipeline
+from bayesfred.commands.records import JointResult, Result, Simulated
+from bayesfred.commands.results import How, Job, Say, may_write_run, write_results
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io import outputs, paths
 from bayesfred.io.catalogues import CatalogueRecord, write_catalogue
 from bayesfred.io.frames import write_frame
-from bayesfred.joint_settings import JointRun, read_run
 from bayesfred.model.joint import JointPosterior
-from bayesfred.records import JointResult, Result, Simulated
-from bayesfred.results import How, Job, Say, may_write_run, write_results
 from bayesfred.sampling.chainfile import open_chain
+from bayesfred.settings.joint import JointRun, read_run
 
 DEMO_ERROR = 0.001  # pixel
 DEMO_NOTE = (

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from bayesfred import build, joint_pipeline, pipeline, settings
+from bayesfred import build, settings
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis import comparison, cross_check
 from bayesfred.analysis import verify as verification
@@ -15,19 +15,20 @@ from bayesfred.analysis.noise_study import NoiseStudy, noise_study
 from bayesfred.analysis.sbc import SBCResult, simulation_based_calibration
 from bayesfred.analysis.study_table import known_by
 from bayesfred.build import naming
+from bayesfred.commands import joint_pipeline, pipeline
+from bayesfred.commands.records import Compared, Study
+from bayesfred.commands.results import Say
 from bayesfred.errors import InputError
 from bayesfred.io import atomic, marks, outputs, paths, tables
-from bayesfred.joint_settings import JointRun, read_run
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
-from bayesfred.records import Compared, Study
 from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
-from bayesfred.results import Say
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import versions
-from bayesfred.simulation_sections import StudySettings
+from bayesfred.settings.joint import JointRun, read_run
+from bayesfred.settings.simulation import StudySettings
 
 
 def study(

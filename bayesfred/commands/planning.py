@@ -9,14 +9,14 @@ from bayesfred import build, settings
 from bayesfred._typing import PathLike
 from bayesfred.analysis import design as designs
 from bayesfred.build import naming
+from bayesfred.commands.records import Planned
 from bayesfred.errors import InputError
 from bayesfred.io import atomic, outputs, paths, tables
 from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
-from bayesfred.records import Planned
 from bayesfred.reporting.design import design_plot
 from bayesfred.reporting.style import png
-from bayesfred.simulation_sections import DesignSettings
+from bayesfred.settings.simulation import DesignSettings
 
 __all__ = ["design"]
 

@@ -19,7 +19,7 @@ from bayesfred.io.frames import read_stored
 from bayesfred.io.headers import noise_in, units
 from bayesfred.io.paths import may_write
 from bayesfred.io.saturation import plateau
-from bayesfred.sections import toml_text
+from bayesfred.settings.sections import toml_text
 
 STARS = 30  # peaks by which the PSF's width is measured
 KNOWN = 3.0  # standard deviations of a read noise that is worth a key

@@ -13,13 +13,12 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.field import displacement_field
 from bayesfred.build import naming
+from bayesfred.commands.records import Result
 from bayesfred.errors import InputError, printable
 from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io import atomic, marks, outputs, paths, tables
-from bayesfred.joint_settings import JointRun
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.records import Result
 from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.reporting.html import write_report
@@ -31,7 +30,8 @@ from bayesfred.sampling.laplace import laplace
 from bayesfred.sampling.progress import working
 from bayesfred.sampling.record import LONGEST, RunRecord
 from bayesfred.sampling.sampler import sample
-from bayesfred.sections import toml
+from bayesfred.settings.joint import JointRun
+from bayesfred.settings.sections import toml
 
 __all__ = [
     "How",

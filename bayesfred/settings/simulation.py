@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bayesfred.sections import Count, Float, NotNegative, Positive, Section, Seed
+from bayesfred.settings.sections import Count, Float, NotNegative, Positive, Section, Seed
 
 __all__ = ["DesignSettings", "GridSettings", "SimulationSettings", "StudySettings"]
 

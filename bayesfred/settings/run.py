@@ -1,11 +1,10 @@
-"""The run file: one TOML file that says what a run fits, to what, and how.
+"""The run file of one frame: what a run fits, to what, and how.
 
 Each section is a frozen model with the keys, units and defaults of the run file;
 :func:`read_settings` checks all of them at once and says every mistake in one line. The sections
 `[detector]`, `[psf]`, `[noise]` and `[nuisances]` have the fields of the class that they describe,
-see `sections`; `kind` names the class. `frame_sections` has those about the frame, and
-`joint_settings` reads run files of many frames. `build` makes the objects. `sections.toml` gives
-the text that result files keep. `example.toml` beside this module is a complete run file.
+see `sections`; `kind` names the class. `frame` has those about the frame, and `joint` reads run
+files of many frames. `sections.toml` gives the text that result files keep.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import InputError
-from bayesfred.frame_sections import CatalogueSettings, FrameSettings, SkySettings
 from bayesfred.io.reading import require_file
-from bayesfred.sections import (
+from bayesfred.settings.frame import CatalogueSettings, FrameSettings, SkySettings
+from bayesfred.settings.sections import (
     TOO_DEEP,
     Count,
     DistortionSettings,
@@ -33,7 +32,7 @@ from bayesfred.sections import (
     described,
     mistake,
 )
-from bayesfred.simulation_sections import DesignSettings, SimulationSettings, StudySettings
+from bayesfred.settings.simulation import DesignSettings, SimulationSettings, StudySettings
 
 __all__ = [
     "OutputSettings",

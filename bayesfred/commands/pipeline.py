@@ -12,6 +12,8 @@ import numpy as np
 from bayesfred import build, settings
 from bayesfred.analysis.choose_terms import choose_terms
 from bayesfred.build import naming
+from bayesfred.commands.records import Result
+from bayesfred.commands.results import How, Job, Say, make_chain, write_results
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import frames, outputs, paths
 from bayesfred.model.posterior import Posterior
@@ -20,8 +22,6 @@ from bayesfred.optimize.find_map import approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.uncatalogued import find_uncatalogued
-from bayesfred.records import Result
-from bayesfred.results import How, Job, Say, make_chain, write_results
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
 

@@ -13,29 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from bayesfred import build, pipeline
+from bayesfred import build
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics, diagnose
 from bayesfred.analysis.frame_estimates import frame_estimates
 from bayesfred.analysis.remote_frames import RemoteFrames
 from bayesfred.build import naming
-from bayesfred.errors import InputError
-from bayesfred.imaging.psf import PSF, MeasuredPSF
-from bayesfred.io import atomic, marks, outputs, paths
-from bayesfred.io.summary_table import Table, make_table
-from bayesfred.joint_settings import JointRun
-from bayesfred.model.drift import Drift
-from bayesfred.model.joint import JointPosterior
-from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.estimate import MapEstimate, inverse
-from bayesfred.optimize.find_map import find_map
-from bayesfred.optimize.fit_statistics import misfit
-from bayesfred.optimize.joint_map import marginalize_joint_psf
-from bayesfred.records import JointResult, Result
-from bayesfred.reporting.joint import agreement_plot, joint_figures, write_joint_report
-from bayesfred.reporting.posteriors import corner_parameters
-from bayesfred.reporting.style import png
-from bayesfred.results import (
+from bayesfred.commands import pipeline
+from bayesfred.commands.records import JointResult, Result
+from bayesfred.commands.results import (
     How,
     Job,
     Say,
@@ -43,9 +29,24 @@ from bayesfred.results import (
     write_page,
     write_sources,
 )
+from bayesfred.errors import InputError
+from bayesfred.imaging.psf import PSF, MeasuredPSF
+from bayesfred.io import atomic, marks, outputs, paths
+from bayesfred.io.summary_table import Table, make_table
+from bayesfred.model.drift import Drift
+from bayesfred.model.joint import JointPosterior
+from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import MapEstimate, inverse
+from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.fit_statistics import misfit
+from bayesfred.optimize.joint_map import marginalize_joint_psf
+from bayesfred.reporting.joint import agreement_plot, joint_figures, write_joint_report
+from bayesfred.reporting.posteriors import corner_parameters
+from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.progress import working
 from bayesfred.sampling.record import LONGEST, RunRecord
+from bayesfred.settings.joint import JointRun
 
 __all__ = ["files_beside", "fit_frames", "read_frames", "require_frames", "write_joint_results"]
 

@@ -18,10 +18,9 @@ from pydantic import ConfigDict, Field, ValidationError, create_model, model_ser
 
 from bayesfred._typing import PathLike
 from bayesfred.errors import printable
-from bayesfred.frame_sections import FrameSettings
 from bayesfred.io.serialize import TAGS
-from bayesfred.sections import Float, Name, Positive, Section, mistake
-from bayesfred.settings import (
+from bayesfred.settings.frame import FrameSettings
+from bayesfred.settings.run import (
     OutputSettings,
     PriorSettings,
     RunSettings,
@@ -31,6 +30,7 @@ from bayesfred.settings import (
     refused,
     run_table,
 )
+from bayesfred.settings.sections import Float, Name, Positive, Section, mistake
 
 __all__ = ["JointRun", "JointSettings", "read_run"]
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from bayesfred.io.tangent_plane import Parity
-from bayesfred.sections import Float, Name, Positive, Section
+from bayesfred.settings.sections import Float, Name, Positive, Section
 
 __all__ = ["CatalogueSettings", "FrameSettings", "SkySettings", "TargetSettings"]
 
