@@ -92,7 +92,7 @@ def forward_model(
 
 
 def priors_given(run: settings.RunSettings | JointRun) -> dict[str, Any]:
-    """The priors of [prior]; of several frames those that no frame has alone."""
+    """The priors of [prior]. Of several frames: the priors that no frame has alone."""
     return {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
 
 

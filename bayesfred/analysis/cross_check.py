@@ -30,7 +30,7 @@ which makes the mean of d^T C d right where the scatter is estimated from the sa
 Directions. In coordinates where C + P is the identity, C has eigenvalues between 0 and 1: the share
 of what is known that the frame says. Directions below 1/2 are decided by the prior and dropped; the
 degrees of freedom are the number of the others. The displacement field is a linear map of the
-coefficients. Of its principal components, those that make up 99 % of the mean square difference
+coefficients. Of its principal components, the ones that make up 99 % of the mean square difference
 expected over the field are kept.
 
 Several frames. Each half has half of the sources of every frame (`joint_folds`), and t_i has the

@@ -83,7 +83,7 @@ class Design:
     Attributes
     ----------
     points : FieldPoints
-        Of the frame. Those that are not `points.inside` are extrapolated.
+        Of the frame. Points that are not `points.inside` are extrapolated.
     images : ndarray, shape (s, 2), pixel of the fine grid
         Where the catalogue's sources are imaged.
     sd : ndarray, shape (rows, columns), pixel

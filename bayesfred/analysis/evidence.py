@@ -168,7 +168,7 @@ def importance_evidence(
 
 
 def random_numbers(chain: Chain) -> np.random.RandomState:
-    """Random numbers of a chain's seed, apart from those that made it."""
+    """Random numbers of a chain's seed, independent of the numbers that made it."""
     return np.random.RandomState(np.random.MT19937(np.random.SeedSequence([chain.seed, STREAM])))
 
 

@@ -128,7 +128,7 @@ def run(
     overwrite: bool,
     progress: bool,
 ) -> tables.TableRecord:
-    """Do tasks 0 to n - 1 of a study, but those that the table holds already.
+    """Do the tasks 0 to n - 1 of a study that the table does not hold yet.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def _work(
     path: Path,
     how: tuple[Executor | None, int | None, bool],
 ) -> list[str]:
-    """Do tasks and append their rows; the messages of those that the environment made fail."""
+    """Do tasks and append their rows. Return the messages of tasks that the environment failed."""
     executor, workers, progress = how
     blank, lost = [float("nan")] * len(study.columns), []
     with ExitStack() as stack:

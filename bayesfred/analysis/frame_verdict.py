@@ -47,7 +47,7 @@ def total_fit(frames: Mapping[str, "Diagnostics"], joint: JointPosterior) -> dic
 def frame_sensitivities(
     frames: Mapping[str, "Diagnostics"], joint: JointPosterior
 ) -> Sensitivities:
-    """Sensitivities to prior and likelihood; of a shared parameter those that the first frame has.
+    """Sensitivities to prior and likelihood; of a shared parameter, the first frame's.
 
     Parameters
     ----------

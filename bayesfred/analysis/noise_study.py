@@ -253,7 +253,7 @@ def noise_study(
     flux : sequence of float, counts
         Mean flux of the sources; without it, and without those below, as in the model.
     sources : sequence of int
-        Numbers of sources: the brightest, and of equally bright ones those that lie farthest apart.
+        Numbers of sources: the brightest. Among equally bright ones, the most widely spaced.
     psf_sigma : sequence of float, pixel
     exposure : sequence of float
         Factors of flux and background together.

@@ -76,7 +76,7 @@ class Session:
     sent : dict of (str, int) to str
         Which places were sent which frames, and the key of what they prepared them for last.
     workers : set of str
-        Those that answered.
+        The frames that answered.
     """
 
     owner: str = field(default_factory=lambda: uuid.uuid4().hex)

@@ -53,7 +53,7 @@ def draws(
 ) -> Floats:
     """Nearly independent draws, shape (n, d), n about `ess` or more.
 
-    Of a chain with as many effective draws, those that lie an autocorrelation time apart are kept.
+    Of a chain with this many effective draws, draws an autocorrelation time apart are kept.
     It is `sample` that makes the chain, with the stopping rule that every user gets, so that a
     calibration judges that rule, too. Two ensembles are the fewest that R-hat can compare.
     """
@@ -63,7 +63,7 @@ def draws(
         )
         return np.asarray(
             normal[np.isfinite(posterior.log_prob(normal))]
-        )  # those that the prior admits
+        )  # draws that the prior admits
     chain = sample(
         posterior,
         estimate,

@@ -140,7 +140,7 @@ def judge_sampling(
     -------
     well : bool
     sentence : str
-        All criteria, or those that fail.
+        All criteria, or the failed ones.
     """
     names = chain.parameter_names
     worst, least = int(np.argmax(rhat)), int(np.argmin(ess))

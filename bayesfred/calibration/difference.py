@@ -8,7 +8,7 @@ been at another distance. Over the field the covariance of the difference is the
     C = J_a C_a J_a^T + J_b C_b J_b^T,
 
 and the part P d that no pose makes has the covariance P C P^T, with P the projection on what is
-orthogonal to the pose. Of its principal components those that make up 99 % of the mean square
+orthogonal to the pose. Of its principal components, the ones that make up 99 % of the mean square
 expected over the field are kept; the sum of their squares, in units of their errors, is a
 chi-square. On the sky both are compared on the tangent plane, in pixels of the first.
 """

@@ -69,7 +69,7 @@ class JointResult:
     diagnostics : Diagnostics
         Of all frames together.
     summary : astropy.table.Table
-        All parameters, as in `Result`; those that frames share come first.
+        All parameters, as in `Result`; shared ones come first.
     shared : astropy.table.Table
         The rows about what frames share, with `corner` and `corner_sd`.
     frame_table : astropy.table.Table

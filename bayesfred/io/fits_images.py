@@ -172,9 +172,9 @@ def read_fits(
 
 
 def _require_checksum(path: Path, hdus: Any, hdu: Any) -> None:
-    """Refuse an HDU that is not what its checksums say.
+    """Refuse an HDU that differs from its checksums.
 
-    Those that are not used are not asked: they may be large.
+    HDUs that are not used are not asked: they may be large.
     """
     if isinstance(hdu, fits.CompImageHDU):  # the sums are those of the table that holds it
         with open_fits(path, disable_image_compression=True) as stored:

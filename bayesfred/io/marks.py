@@ -100,7 +100,7 @@ def may_replace(run: str, *places: Path) -> None:
     Raises
     ------
     InputError
-        One of them exists, and is not what the run wrote.
+        One of them exists and the run did not write it.
     """
     for place in places:
         if os.path.lexists(place) and not _made_by(place, run):

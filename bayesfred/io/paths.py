@@ -24,7 +24,7 @@ def may_write(
     beside: Sequence[PathLike] = (),
     inputs: Sequence[PathLike] = (),
 ) -> bool:
-    """Refuse to replace files that nobody asked to replace, and those that are read.
+    """Refuse to replace files that are read, or that nobody asked to replace.
 
     Parameters
     ----------

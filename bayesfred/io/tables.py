@@ -155,7 +155,7 @@ def require_checks(path: Path, text: str, key: str) -> None:
         body, _, check = line.rpartition(",")
         if check != _check(key, body):
             raise InputError(
-                f"{path}: line {at}: got a row that is not what its check says, expected it as it "
+                f"{path}: line {at}: got a row that differs from its check, expected it as it "
                 "was written: remove the line, and its task is done again"
             )
         before = seen.setdefault(body.partition(",")[0], at)

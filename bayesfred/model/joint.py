@@ -40,7 +40,7 @@ from bayesfred.model.shared_parameters import (
 @serializable("joint_posterior")
 @dataclass(frozen=True, eq=False, init=False)
 class JointPosterior(FrameDensity):
-    """Posterior of the parameters that several frames share, and of those that each has.
+    """Posterior of the parameters that several frames share and of each frame's own.
 
     Parameters
     ----------

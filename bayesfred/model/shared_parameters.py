@@ -20,7 +20,7 @@ class Part(NamedTuple):
     columns : ndarray of int, shape (d_i,)
         Where each of the frame's parameters is; of a drifting one its constant part.
     own : ndarray of int, shape (q_i,)
-        Columns of those that no other frame has.
+        Columns of parameters that no other frame has.
     places : ndarray of int, shape (q_i,)
         Where the latter are among the frame's parameters.
     matrix : ndarray, shape (d_i, p)

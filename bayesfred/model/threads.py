@@ -1,4 +1,4 @@
-"""The threads that share an ensemble's walkers with the calling one, as many as numba may use."""
+"""The threads that share an ensemble's walkers with the calling one, up to numba's limit."""
 
 import os
 import threading

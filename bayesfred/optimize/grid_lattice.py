@@ -29,8 +29,8 @@ BASIS = {
     "hexagonal": np.array([[1.0, 0.5], [0.0, 0.75**0.5]]),  # columns e1 and e2
 }
 GATE = 0.2  # farthest a point lies from its prediction, in pitches
-REACH = 2.3  # a cell is predicted from those that are nearer, in pitches: across one missing row
-WIDE = 3.3  # ... or, where these do not determine it, from those that are nearer than this
+REACH = 2.3  # a cell is predicted from marks nearer than this, in pitches: across one missing row
+WIDE = 3.3  # ... or, where these do not determine it, nearer than this
 ALIKE = 0.18  # two vectors of a seed are taken for one, in parts of their length
 OUTLIER = 6.0  # of a residual, in standard deviations of all, where it is more than ...
 SLACK = 0.04  # ... this, in pitches

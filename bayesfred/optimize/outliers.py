@@ -48,7 +48,7 @@ MOST = 0.7
 # crowded fields with a tenth missing and a tenth foreign, wrong ones lose 0.44 to 0.7 of them,
 # right ones 0.27 to 0.48.
 BREAKDOWN = 0.4
-LOOKS = 10  # for peaks, those that others hid among them
+LOOKS = 10  # for peaks, also for those hidden by others
 ROUNDS = 8
 STEPS = 8  # of Newton's method between two rejections
 
@@ -153,7 +153,7 @@ class _Residuals:
         self.expected = posterior.expected_counts(params)
 
     def share(self, lost: Flags) -> float:
-        """Of the sources in the frame, those that are lost."""
+        """Sources in the frame that are lost."""
         return float(lost[self.inside].sum() / max(int(self.inside.sum()), 1))
 
     def none_left(self, missing: Flags) -> bool:
@@ -214,7 +214,7 @@ class _Residuals:
     def _image(self, positions: Floats, flux: Floats) -> Floats:
         """Detections as the sources' distortion images them, shape (ny, nx).
 
-        Those that it cannot have imaged are rendered as the PSF alone.
+        Sources that it cannot have imaged are rendered as the PSF alone.
         """
         model = self.posterior.model
         theta = self.params[: model.distortion.n_terms]

@@ -65,7 +65,7 @@ def typical_flux(counts: Floats, mask: Flags, width: float, number: int) -> floa
     width : float, recorded pixel
         The PSF's, pixels included.
     number : int
-        How many peaks: as many as there are sources.
+        How many peaks: the number of sources.
 
     Returns
     -------

@@ -35,7 +35,7 @@ FARTHEST = 8.0  # filter widths from a star to which the PSF's misfit is followe
 RINGS = 2  # a filter width
 FEW, MANY = 5, 0.05  # so many near stars, or this share of the stars, may be found
 LOOSER = 6  # times the misfit is doubled, at most, until they are so few: then it is the PSF's
-LOOKS = 5  # for peaks, those that others hid among them
+LOOKS = 5  # for peaks, also for those hidden by others
 NAMED = 10  # sources in the message
 LEFT = 0.5  # share of its light that a source must keep, or it is left out with the light beside it
 

@@ -93,7 +93,7 @@ def _draw_phase(ax: Axes, phases: tuple[PixelPhase, PixelPhase]) -> None:
 
 
 def _draw_sources(fig: Figure, ax: Axes, residuals: Residuals, shape: tuple[int, int]) -> None:
-    """Every source's chi-square, in standard deviations; rings around those that do not fit."""
+    """Every source's chi-square, in standard deviations, with rings around poor fits."""
     ny, nx = shape
     table = residuals.sources
     z = np.asarray(table["chi2_z"])

@@ -142,7 +142,7 @@ def joint_figures(
     estimates : FrameEstimates
         Of its `shared` parameters.
     shown : sequence of int
-        Indices of those that are shown in pairs.
+        Indices of the parameters shown in pairs.
 
     Returns
     -------

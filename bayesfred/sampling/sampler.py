@@ -83,7 +83,7 @@ def sample(
         Walkers of each ensemble, even and at least 4.
     target_ess : float
         Sampling ends when every parameter's bulk and tail effective sample sizes reach this and its
-        R-hat is at most 1.01, or after 100,000 steps, or as many as fit in memory.
+        R-hat is at most 1.01, or after 100,000 steps, or when memory is full.
     steps : int, optional
         Run to this total number of steps instead.
     resume : bool

@@ -71,7 +71,7 @@ class StudySettings(Section):
     flux : tuple of float, optional, counts
         Mean fluxes of the sources.
     sources : tuple of int, optional
-        Numbers of sources: the brightest, and of equally bright ones those that lie farthest apart.
+        Numbers of sources: the brightest. Among equally bright ones, the most widely spaced.
     psf_sigma : tuple of float, optional, pixel
         Widths of the PSF.
     exposure : tuple of float, optional

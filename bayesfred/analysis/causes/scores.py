@@ -107,7 +107,7 @@ def _numbers(which: tuple[str, str], leads: list[Lead]) -> Finding:
 
 
 def _few_sources(posterior: Posterior, failed: Ints, explained: float) -> Finding:
-    """Sources that are not what the catalogue says."""
+    """Sources that differ from the catalogue."""
     s = posterior.model.sources
     names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in failed[:NAMED])
     more = ", ..." if failed.size > NAMED else ""
