@@ -5,13 +5,19 @@ pixel the image lies, as soon as pixels are coarse. So the displacements y of th
 model are fitted by a constant and two harmonics of the phase, sin and cos of 2 pi phase and 4 pi
 phase. The fit of the model has taken its part of y: with V its variances, D the derivatives of the
 images by the parameters and C the covariance of these, the covariance of y is V - D C D^T. The
-chi-square of the four amplitudes is judged by what of it is left to them. Where positions scatter,
-the scatter at the maximum is too small by what the coefficients took, so the rest of y gives the
-scale of the errors, and the ratio of the two is an F.
+chi-square of the four amplitudes is judged by what of it is left to them.
+
+Where positions scatter, y has the heavy tails of Student's distribution with nu degrees of freedom.
+A shift r counts by its score s = (nu + 2) r / (nu tau^2 + r^2), whose variance along one axis is
+the information I = (nu + 2) / ((nu + 4) tau^2). So y is s / I, of variance 1 / I: a source far off
+counts little. The variance of the counts adds to r / s and to 1 / I. The scatter at the maximum is
+too small by what the coefficients took, so the rest of y gives the scale of the errors, and the
+ratio of the two is an F.
 
 References
 ----------
 J. Anderson, I. R. King (2000), PASP 112, 1360: pixel-phase errors.
+K. L. Lange, R. J. A. Little, J. M. G. Taylor (1989), JASA 84, 881: information of Student's t.
 """
 
 import math
@@ -24,6 +30,7 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.absorbed import responses
 from bayesfred.analysis.checks import Check, deviate, deviate_of_ratio, not_tested
 from bayesfred.analysis.sources import SourceFits
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.posterior import Posterior
 
 __all__ = ["PixelPhase", "harmonics", "phase_check", "pixel_phase"]
@@ -37,7 +44,7 @@ class PixelPhase(NamedTuple):
     """Displacement along one axis as a function of the image's position within its pixel."""
 
     phase: Floats  # (n,) -0.5 to 0.5, of the sources that take part
-    displacement: Floats  # (n,) pixel
+    displacement: Floats  # (n,) pixel; one far off where positions scatter is shortened
     sd: Floats  # (n,) pixel
     coefficients: Floats  # (5,) of 1, and sin and cos of 2 pi phase and 4 pi phase; pixel
     covariance: Floats  # (4, 4) of the last four
@@ -72,16 +79,19 @@ def pixel_phase(
     """
     step = float(posterior.model.detector.binning)
     moves = fits.to_image @ responses(posterior, params, fits)[:, 1:3] / step
+    displacement = fits.moved / step
     variance = np.diagonal(fits.moved_covariance, axis1=1, axis2=2) / step**2
     if posterior.nuisances.position_scatter:
-        scatter = fits.scatter[:, None] / step**2
-        variance = variance + scatter * np.sum(fits.to_image**2, axis=2)
+        scatter = fits.scatter[:, None] * np.sum(fits.to_image**2, axis=2) / step**2
+        expected = variance + scatter * fits.place_weight[:, None] * (DOF + 4.0) / DOF
+        displacement = displacement * expected / (variance + scatter)
+        variance = expected
     middle = 0.5 * (np.array(posterior.counts.shape[::-1]) - 1.0)
     place = fits.own.image / step + middle
     phase = place - np.rint(place)
     u, v = (
         _fit_harmonics(
-            phase[:, k], fits.moved[:, k] / step, variance[:, k], (moves[:, k], covariance),
+            phase[:, k], displacement[:, k], variance[:, k], (moves[:, k], covariance),
             scaled=posterior.nuisances.position_scatter,
         )
         for k in range(2)
