@@ -51,13 +51,13 @@ def sensitivities(chain: Chain) -> Sensitivities:
     Sensitivities
         nan where draws are too few or do not vary.
     """
-    posterior, names, draws = chain.posterior(), chain.parameter_names, _draws(chain)
+    posterior, draws = chain.posterior(), _draws(chain)
     log_prob = chain.log_prob[:, chain.burn_in :].swapaxes(1, 2).ravel()
     log_prior = posterior.log_prior(draws)
-    prior = _sensitivity(names, draws, log_prior)
+    prior = _sensitivity(draws, log_prior)
     dominated = prior >= INFORMATIVE
     dominated[dominated] = _visible(chain, posterior, np.flatnonzero(dominated))
-    return Sensitivities(prior, _sensitivity(names, draws, log_prob - log_prior), dominated)
+    return Sensitivities(prior, _sensitivity(draws, log_prob - log_prior), dominated)
 
 
 def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
@@ -79,9 +79,9 @@ def _visible(chain: Chain, posterior: Posterior, parameters: Ints) -> Flags:
     u, v = d.image_position(chain.estimate.params[: d.n_terms], x, y)
     imaged = np.isfinite(u + v)
     design = d.design_matrix(u[imaged], v[imaged], x[imaged], y[imaged]).reshape(-1, d.n_terms)
-    draws, names = _draws(chain), tuple(chain.parameter_names[k] for k in terms)
+    draws = _draws(chain)
     components = draws[:, : d.n_terms] @ (design.T @ design[:, terms])
-    sensitivity = _sensitivity(names, components, posterior.log_prior(draws))
+    sensitivity = _sensitivity(components, posterior.log_prior(draws))
     visible[parameters < d.n_terms] = sensitivity >= INFORMATIVE
     return visible
 
@@ -92,17 +92,18 @@ def _draws(chain: Chain) -> Floats:
     return kept.swapaxes(1, 2).reshape(-1, len(chain.parameter_names))
 
 
-def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Floats:
-    """Sensitivity of every parameter to one factor of the posterior, shape (d,).
+def _sensitivity(draws: Floats, log_part: Floats) -> Floats:
+    """Sensitivity of every column of the draws to one factor of the posterior, shape (d,).
 
     `log_part` is the factor's logarithm at the draws, shape (n,).
     """
     if len(draws) < FEWEST or not np.all(np.isfinite(log_part)):
-        return np.full(len(names), np.nan)
+        return np.full(draws.shape[1], np.nan)
     if np.ptp(log_part) < FLAT:
-        return np.zeros(len(names))
-    posterior = {name: draws[None, :, k] for k, name in enumerate(names)}
-    data = arviz_base.from_dict({"posterior": posterior, "log_prior": {"part": log_part[None]}})
+        return np.zeros(draws.shape[1])
+    # one variable of d numbers: of d variables each would take as long
+    groups = {"posterior": {"draws": draws[None]}, "log_prior": {"part": log_part[None]}}
+    data = arviz_base.from_dict(groups)
     with (
         warnings.catch_warnings(),
         np.errstate(invalid="ignore"),
@@ -112,5 +113,5 @@ def _sensitivity(names: tuple[str, ...], draws: Floats, log_part: Floats) -> Flo
         try:
             sensitivity = arviz_stats.psense(data)
         except ValueError:  # hardly a draw differs from another
-            return np.full(len(names), np.nan)
-    return np.array([float(sensitivity[name]) for name in names])
+            return np.full(draws.shape[1], np.nan)
+    return np.asarray(sensitivity["draws"], dtype=np.float64)
