@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.collections import EllipseCollection
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.quiver import Quiver
@@ -35,18 +36,14 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.reporting.field import field_plot
 from bayesfred.reporting.figures import PageFigure, described_residual, page_figures
-from bayesfred.reporting.frames import FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.frames import MASKED, FittedFrame, star_panels
 from bayesfred.reporting.html import write_report
-from bayesfred.reporting.labels import axis_label
-from bayesfred.reporting.posteriors import (
-    corner_parameters,
-    corner_plot,
-    marginal_plot,
-    overview,
-    trace_plot,
-)
+from bayesfred.reporting.labels import axis_label, math_symbol
+from bayesfred.reporting.pairs import corner_parameters, corner_plot
+from bayesfred.reporting.panels import round_ticks
+from bayesfred.reporting.posteriors import marginal_plot, overview, trace_plot
 from bayesfred.reporting.screen import parameter_table
-from bayesfred.reporting.style import embedded
+from bayesfred.reporting.style import embedded, png
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.summary import summary, unit_text
 
@@ -130,6 +127,23 @@ def pixels(figure: Figure) -> Floats:
     return np.asarray(imread(buffer))
 
 
+def texts_of(figure: Figure) -> list[str]:
+    """What is written on a sheet of panels."""
+    return [text.get_text() for text in figure.axes[0].texts]
+
+
+def boxes_of(figure: Figure) -> list[Floats]:
+    """Lower left and upper right corners of a sheet's panels, inch, each of shape (2, 2)."""
+    frames: Any = figure.axes[0].collections[-1]
+    return [segment[[0, 2]] for segment in frames.get_segments() if len(segment) == 5]
+
+
+def colour_at(figure: Figure, place: Floats) -> Floats:
+    """The colour of a sheet's images at a place in inches."""
+    column, row = (100.0 * place).astype(int)
+    return np.asarray(values(figure.axes[0]))[row, column] / 255.0
+
+
 def values(ax: Any) -> Any:
     """The masked array of an axis's image."""
     return ax.images[0].get_array()
@@ -176,7 +190,8 @@ def figures_of(
     diagnostics = replace(diagnose(chain), residuals=residuals)
     frame = frame or fitted(posterior, params)
     field, _ = field_of(Detector((61, 81)), 0.02)
-    return diagnostics, page_figures(frame, chain, diagnostics, field, **options)
+    picture = png(overview(frame, chain.draws(), posterior.parameters))
+    return diagnostics, page_figures(frame, chain, diagnostics, field, picture=picture, **options)
 
 
 def report(tmp_path: Path, *, truth: Floats | None = None, **changes: Any) -> tuple[str, Page]:
@@ -434,12 +449,12 @@ def test_a_term_at_the_corner_is_its_largest_displacement_there() -> None:
 @pytest.mark.parametrize(
     ("name", "label", "unit"),
     [
-        ("f_ux2", r"$f_{u x^2}$ [$10^{-6}$ px$^{-2}$]", "px^-2"),
-        ("g_vy", r"$g_{v y}$ [$10^{-6}$ px$^{-1}$]", "px^-1"),
-        ("background", r"background [$10^{-6}$ counts]", "counts"),
-        ("background_uv", r"$b_{u v}$ [$10^{-6}$ counts]", "counts"),
-        ("psf_sigma", r"psf sigma [$10^{-6}$ px]", "px"),
-        ("flux_scale", r"flux scale [$10^{-6}$]", ""),
+        ("f_ux2", r"$f_{u x^2}$ [10⁻⁶ px⁻²]", "px^-2"),
+        ("g_vy", r"$g_{v y}$ [10⁻⁶ px⁻¹]", "px^-1"),
+        ("background", r"background [10⁻⁶ counts]", "counts"),
+        ("background_uv", r"$b_{u v}$ [10⁻⁶ counts]", "counts"),
+        ("psf_sigma", r"psf sigma [10⁻⁶ px]", "px"),
+        ("flux_scale", r"flux scale [10⁻⁶]", ""),
     ],
 )
 def test_labels_carry_power_and_unit(name: str, label: str, unit: str) -> None:
@@ -490,7 +505,7 @@ def field_of(detector: Detector, scale: float, n: int = 25) -> tuple[Any, Any]:
 @pytest.mark.parametrize("binning", [1, 2])
 def test_displacements_are_shown_at_the_stated_scale(binning: int) -> None:
     field, sources = field_of(Detector((61, 81), binning=binning), 0.02)
-    above, below, _ = field_plot(field, sources, binning).axes
+    above, below = field_plot(field, sources, binning).axes
     unit = "px" if binning == 1 else "fine px"
     assert above.get_xlabel() == f"u / {unit}"
     arrows = next(c for c in above.collections if isinstance(c, Quiver))
@@ -553,26 +568,46 @@ def test_corner_marks_truth_and_estimate_and_states_its_powers() -> None:
         truth=truth,
         estimate=chain.estimate.params,
     )
-    assert len(figure.axes) == 25
-    assert "10^{-6}" in figure.axes[-4].get_xlabel()
-    assert "background" in figure.axes[-1].get_xlabel()
-    low, high = figure.axes[-4].get_xlim()
-    assert low < -2.0 < high and high - low < 2.0
-    assert all(len(axis.get_ticklocs()) <= 4 for ax in figure.axes for axis in (ax.xaxis, ax.yaxis))
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["truth", "MAP"]
+    assert len(boxes_of(figure)) == 15
+    texts = texts_of(figure)
+    assert {"$f_{u x^2}$\n[10⁻⁶ px⁻²]", "background\n[counts]", "truth", "MAP"} <= set(texts)
+    assert "−2.0" in texts and all(len(text) < 30 for text in texts)
     assert pixels(figure).std() > 0.02
 
 
+def test_a_corner_of_some_shows_the_correlations_of_all() -> None:
+    """The cell of a pair that was made correlated is red, that of its opposite blue."""
+    draws = np.random.default_rng(4).normal(size=(2000, 12))
+    draws[:, 9] += 3.0 * draws[:, 2]
+    draws[:, 11] -= 3.0 * draws[:, 0]
+    parameters = described(*(f"name {k}" for k in range(12)))
+    shown = corner_parameters(draws, [parameter.name for parameter in parameters])
+    figure = corner_plot(draws, parameters, shown=shown)
+    assert len(shown) == 8 and {0, 2, 9, 11} <= set(shown)
+    boxes = boxes_of(figure)
+    assert len(boxes) == 36 + 1  # and the scale of the correlations
+    assert "correlations of all 12" in texts_of(figure)
+    corner = np.array([text.get_position() for text in figure.axes[0].texts[-16:-4]])
+    for name, colour in (("name 9", "red"), ("name 11", "blue")):
+        k = {"name 9": (9, 2), "name 11": (11, 0)}[name]
+        red, _, blue, _ = colour_at(figure, np.array([corner[k[1], 0], corner[k[0], 1]]))
+        assert (red > blue + 0.3) if colour == "red" else (blue > red + 0.3)
+    everything = corner_plot(draws, parameters)
+    assert len(boxes_of(everything)) == 78 and not everything.axes[0].images
+
+
 def test_corner_chooses_the_most_correlated_pairs() -> None:
-    """Of thirty parameters, the six pairs that were made correlated; otherwise those named."""
+    """Of thirty parameters, four of the six pairs that are correlated; otherwise those named."""
     draws = np.random.default_rng(4).normal(size=(2000, 30))
     for k in range(6):
         draws[:, 29 - k] += 2.0 * draws[:, k]
     draws[:, 10] = 3.0
     names = [f"p{k}" for k in range(30)]
-    assert corner_parameters(draws, names) == (*range(6), *range(24, 30))
+    chosen = corner_parameters(draws, names)
+    assert len(chosen) == 8 and set(chosen) <= {*range(6), *range(24, 30)}
+    assert chosen[:4] == tuple(29 - k for k in chosen[:3:-1])  # both parameters of every pair
     assert corner_parameters(draws, names, ["p20", "p3"]) == (3, 20)
-    assert corner_parameters(draws[:, :12], names[:12]) == tuple(range(12))
+    assert corner_parameters(draws[:, :8], names[:8]) == tuple(range(8))
     with pytest.raises(InputError, match="corner: got p30, q, expected names among p0, p1"):
         corner_parameters(draws, names, ["p1", "p30", "q"])
 
@@ -585,15 +620,43 @@ def test_marginals_have_a_panel_and_a_prior_for_each_parameter(d: int) -> None:
     draws, middle = rng.normal(size=(800, d)), np.zeros(d)
     draws[:, 0] = 3.0  # never moved
     figure = marginal_plot(draws, parameters, priors, truth=middle, estimate=middle)
-    shown = [ax for ax in figure.axes if ax.get_visible()]
-    assert len(shown) == d
-    for ax in shown[1:]:
-        height = ax.get_ylim()[1]
-        prior = next(
-            np.asarray(line.get_ydata()) for line in ax.lines if line.get_label() == "prior"
-        )
-        assert max(prior) == pytest.approx(norm.pdf(0.0), rel=0.01) and height > max(prior)
+    assert len(boxes_of(figure)) == d
+    priors_shown = next(
+        c.get_segments()
+        for c in figure.axes[0].collections
+        if isinstance(c, LineCollection) and len(c.get_segments()[0]) == 40
+    )
+    assert len(priors_shown) == d + 1  # and one in the legend
+    posteriors = [
+        c.get_segments()
+        for c in figure.axes[0].collections
+        if isinstance(c, LineCollection) and len(c.get_segments()[0]) == 82
+    ]
+    for prior, posterior in zip(priors_shown[1:-1], posteriors[0][1:-1], strict=True):
+        base = posterior[0, 1]
+        # as high as the histogram, which is of the prior's own draws
+        assert np.ptp(prior[:, 1]) < np.max(posterior[:, 1]) - base < 2.0 * np.ptp(prior[:, 1])
     assert pixels(figure).std() > 0.02
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [
+        (-3.1, 2.9, ["−2", "0", "2"]),
+        (0.99999, 1.00001, ["0.999995", "1.000000", "1.000005"]),
+        (0.0, 2e5, ["50000", "100000", "150000"]),
+        (4.0, 4.0 + 1e-13, None),
+    ],
+)
+def test_ticks_are_written_with_the_digits_that_they_have(
+    low: float, high: float, labels: list[str] | None
+) -> None:
+    ticks, written = round_ticks(low, high)
+    assert labels is None or written == labels
+    assert np.all((low < ticks) & (ticks < high)) and len(written) == len(ticks)
+    assert [float(text.replace("−", "-")) for text in written] == pytest.approx(
+        ticks, abs=1e-3 * (high - low)
+    )
 
 
 def test_corner_of_a_parameter_that_never_moved() -> None:
@@ -610,10 +673,10 @@ def test_trace_has_a_panel_for_every_parameter(d: int) -> None:
         burn_in=1,
     )
     figure = trace_plot(chain, described(*chain.parameter_names))
-    shown = [ax for ax in figure.axes if ax.get_visible()]
-    assert len(shown) == 2 * d
-    labels = [ax.get_ylabel() for ax in shown[::2]]
-    assert labels[0].startswith("$f_{u x}$") and len(set(labels)) == d
+    assert len(boxes_of(figure)) == 2 * d
+    labels = {text.split("\n")[0] for text in texts_of(figure)}
+    assert "$f_{u x}$" in labels
+    assert {math_symbol(parameter) for parameter in described(*chain.parameter_names)} <= labels
     pixels(figure)
 
 
@@ -626,7 +689,8 @@ def test_triptych_axes_count_pixels_from_the_middle(shape: tuple[int, int]) -> N
     mask = np.zeros(shape, bool)
     mask[ny // 4 - 3 : ny // 4 + 4, nx // 4 - 3 : nx // 4 + 4] = True
     # not the root of the counts: the noise model's word is taken
-    figure = frame_triptych(FittedFrame(counts, expected, 2.0 * np.sqrt(expected), mask))
+    fitted = FittedFrame(counts, expected, 2.0 * np.sqrt(expected), mask)
+    figure = overview(fitted, np.zeros((2, 1)), described("f_ux"))
     frame, model, residual = figure.axes[:3]
     for ax in (frame, model, residual):
         assert ax.get_xlim() == (-nx / 2, nx / 2) and ax.get_ylim() == (-ny / 2, ny / 2)
@@ -648,17 +712,24 @@ def test_star_panels_show_the_brightest_inside_the_frame() -> None:
     everywhere = np.ones(expected.shape, bool)
     frame = FittedFrame(expected + 3.0, expected, expected**0.5, everywhere)
     figure = star_panels(frame, u, v, half_width=3)
-    stamps = [
-        ax for ax in figure.axes if ax.images and ax.get_xlabel() == "" and len(values(ax)) == 7
-    ]
-    assert len(stamps) == 9
-    brightest, difference = values(stamps[0]), values(stamps[2])
-    assert float(brightest[3, 3]) == 103.0
-    assert float(difference[3, 3]) == pytest.approx(0.3) and float(
-        difference[0, 0]
-    ) == pytest.approx(3.0)
-    corner = values(stamps[3])
-    assert float(corner[3, 3]) == 53.0 and np.ma.count(corner) == 16
+    *boxes, scale = boxes_of(figure)
+    assert len(boxes) == 9
+    places = [text for text in texts_of(figure) if "," in text]
+    assert places[:2] == ["−10, −10", "+30, +20"]
+
+    def residual_shown(box: Floats, across: float, up: float) -> float:
+        """Where the colour of a place in a panel is on the scale."""
+        seen = colour_at(figure, box[0] + [across, up] * (box[1] - box[0]))
+        heights = np.linspace(*scale[:, 1], 199)[1:-1]
+        middle = scale[:, 0].mean()
+        colours = np.array([colour_at(figure, np.array([middle, y])) for y in heights])
+        return -5.0 + 10.0 * float(np.argmin(np.abs(colours - seen).sum(axis=1))) / 196.0
+
+    assert residual_shown(boxes[2], 0.5, 0.5) == pytest.approx(0.3, abs=0.1)
+    assert residual_shown(boxes[2], 0.05, 0.05) == pytest.approx(3.0, abs=0.1)
+    # beyond the frame
+    assert colour_at(figure, boxes[3][1] - 0.05) == pytest.approx(to_rgba(MASKED), abs=0.01)
+    assert colour_at(figure, boxes[3][0] + 0.05) != pytest.approx(to_rgba(MASKED), abs=0.01)
     pixels(figure)
 
 
@@ -668,9 +739,9 @@ def test_star_panels_show_at_most_24_and_survive_none() -> None:
     rng = np.random.default_rng(5)
     u, v = rng.uniform(-20, 20, (2, 40))
     many = star_panels(frame, u, v, half_width=2)
-    assert sum(len(ax.texts) for ax in many.axes) == 24
+    assert sum("," in text for text in texts_of(many)) == 24
     none = star_panels(frame, u + 100, v, half_width=2)
-    assert "no source" in none.texts[0].get_text()
+    assert "no source" in texts_of(none)[0]
 
 
 @pytest.mark.parametrize("shape", [(1, 4000), (4000, 1), (1, 1)])
@@ -678,12 +749,8 @@ def test_strips_of_a_frame_make_pictures_of_a_usual_size(shape: tuple[int, int])
     four = np.full(shape, 4.0)
     frame = FittedFrame(four, four, four**0.5, four > 0)
     draws = np.random.default_rng(5).normal(size=(100, 2))
-    for figure in (
-        frame_triptych(frame),
-        overview(frame, draws, described("f_ux", "background")),
-    ):
-        height, width, _ = pixels(figure).shape
-        assert 0.1 < height / width < 1.2
+    height, width, _ = pixels(overview(frame, draws, described("f_ux", "background"))).shape
+    assert 0.1 < height / width < 1.2
 
 
 @pytest.mark.parametrize("with_truth", [True, False])
@@ -700,5 +767,5 @@ def test_overview_shows_frame_and_marginals(with_truth: bool) -> None:
 @pytest.mark.parametrize("size", [(7.0, 3.3), (1.0 / 3.0, 2.7182818), (5.25, 4.9999)])
 def test_figures_of_any_size_are_embedded(size: tuple[float, float]) -> None:
     """A size that is no whole number of pixels is rounded as the renderer rounds it."""
-    image = embedded(Figure(figsize=size, dpi=100))
+    image = embedded(png(Figure(figsize=size)))
     assert abs(image.width - 100 * size[0]) <= 1 and abs(image.height - 100 * size[1]) <= 1

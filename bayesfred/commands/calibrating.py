@@ -100,7 +100,7 @@ def calibration(
             known, known.displacement_map(step), known.psf_map(step), hull_of(known.sources)
         )
         paths.may_write(picture, overwrite=overwrite)
-        atomic.replace(picture, png(figure))
+        atomic.replace(picture, png(figure, 150))
         return Calibrated(known, {label: path, "maps": maps, "picture": picture})
     lines = _export(chain, known, form, path, (degree, focal_length, overwrite))
     return Calibrated(known, {label: path}, lines)

@@ -226,7 +226,7 @@ def report(
     target_ess : float, optional
         Effective draws to ask of every parameter; by default the number that the run was made for.
     corner : sequence of str, optional
-        Parameters to show in pairs; by default all, or of more than twelve those of the most
+        Parameters to show in pairs; by default all, or of more than eight those of the most
         correlated pairs.
     out : path-like, optional
         The page, .html; by default beside the chain. The other files go beside the page.

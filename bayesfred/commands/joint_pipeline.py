@@ -41,7 +41,7 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_statistics import misfit
 from bayesfred.optimize.joint_map import marginalize_joint_psf
 from bayesfred.reporting.joint import agreement_plot, joint_figures, write_joint_report
-from bayesfred.reporting.posteriors import corner_parameters
+from bayesfred.reporting.pairs import corner_parameters
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.progress import working
@@ -306,6 +306,7 @@ def write_joint_results(
     frames = _frame_table(diagnostics, posterior)
     if not overwrite:
         marks.may_replace(chain.identity, page, picture, sources)
+    content = png(agreement_plot(estimates, posterior.parameters))
     write_joint_report(
         page,
         chain=chain,
@@ -313,10 +314,9 @@ def write_joint_results(
         diagnostics=diagnostics,
         frames=frames,
         pages={name: result.page for name, result in results.items()},
-        figures=joint_figures(chain, estimates, shown=shown),
+        figures=joint_figures(chain, estimates, picture=content, shown=shown),
         result=estimates.message,
     )
-    content = png(agreement_plot(estimates, posterior.parameters))
     atomic.replace(picture, marks.marked(content, chain.identity))
     write_sources(sources, diagnostics, chain.identity)
     return JointResult(

@@ -127,7 +127,7 @@ def _write_study(
     if not overwrite:  # asked again, as what was not there may have come in the meantime
         marks.may_replace(run, findings, picture)
     tables.write_table(findings, record, overwrite=True, run=run)
-    atomic.replace(picture, marks.marked(png(figure), run))
+    atomic.replace(picture, marks.marked(png(figure, 150), run))
     return Study(result, table, findings, picture)
 
 

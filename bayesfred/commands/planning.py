@@ -72,7 +72,7 @@ def design(run_file: PathLike, *, overwrite: bool = False) -> Planned:
         outputs.make_folder(table)
     paths.may_write(table, overwrite=overwrite, beside=(picture,))  # they may have come since
     tables.write_table(table, _record(plan, posterior), overwrite=overwrite)
-    atomic.replace(picture, png(design_plot(plan)))
+    atomic.replace(picture, png(design_plot(plan), 150))
     return Planned(plan, table, picture)
 
 

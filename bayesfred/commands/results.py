@@ -22,7 +22,8 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
 from bayesfred.reporting.html import write_report
-from bayesfred.reporting.posteriors import corner_parameters, overview
+from bayesfred.reporting.pairs import corner_parameters
+from bayesfred.reporting.posteriors import overview
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
@@ -312,16 +313,18 @@ def write_page(
     if not overwrite:  # asked again, as what was not there may have come while the run was made
         own = [psf_file] * measured + [sources] * (home is None)
         marks.may_replace(run, page, picture, *own)
+    content = png(overview(fitted, chain.draws(), posterior.parameters, truth=truth))
     write_report(
         page,
         chain=chain,
         summary=table,
         diagnostics=diagnostics,
-        figures=page_figures(fitted, chain, diagnostics, field, shown=shown, truth=truth),
+        figures=page_figures(
+            fitted, chain, diagnostics, field, picture=content, shown=shown, truth=truth
+        ),
         result=field.message,
         home=home,
     )
-    content = png(overview(fitted, chain.draws(), posterior.parameters, truth=truth))
     atomic.replace(picture, marks.marked(content, run))
     if measured:
         posterior.model.psf.write(psf_file, overwrite=True, run=run)

@@ -26,6 +26,7 @@ from bayesfred.reporting.html import (
     render,
 )
 from bayesfred.reporting.labels import html_symbol, html_unit, scale_of
+from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.record import RunRecord
 
@@ -141,6 +142,6 @@ def _residuals(runs: Sequence[ComparedRun]) -> list[PageFigure]:
             "Residuals",
             "At each run's MAP, on one scale. Green pixels do not enter the likelihood.",
             " ".join(f"Run {k}: {described_residual(frame)}" for k, frame in enumerate(fitted, 1)),
-            residual_panels(fitted),
+            png(residual_panels(fitted)),
         )
     ]

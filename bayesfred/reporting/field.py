@@ -27,7 +27,8 @@ __all__ = ["field_plot"]
 SIZES = LinearSegmentedColormap.from_list("sizes", ["#ffffff", "#9ecae1", "#4292c6"])
 EXTRAPOLATED = "0.45"
 SIGNIFICANT = 3.0  # standard deviations
-WIDTH = 6.2  # inch
+WIDTH, SIDE = 6.2, 4.4  # inch, of the figure and a panel
+BELOW, ABOVE = 0.75, 0.55  # inch, around a panel
 
 Strings = NDArray[np.str_]
 
@@ -49,9 +50,13 @@ def field_plot(field: DisplacementField, sources: Table, binning: int = 1) -> Fi
         One panel above the other, both in pixels of the fine grid.
     """
     u, v = field.points.u, field.points.v
-    ratio = min(max(float(np.ptp(v) / np.ptp(u)), 0.3), 1.6)
-    fig = Figure(figsize=(WIDTH, 2.2 + 2.0 * 0.8 * WIDTH * ratio), dpi=100, layout="constrained")
-    above, below = fig.subplots(2, 1)
+    high = SIDE * min(max(float(np.ptp(v) / np.ptp(u)), 0.3), 1.6)
+    height = 2.0 * (high + BELOW + ABOVE)
+    fig = Figure(figsize=(WIDTH, height), dpi=100)
+    above, below = (
+        fig.add_axes((0.8 / WIDTH, bottom / height, SIDE / WIDTH, high / height))
+        for bottom in (2.0 * BELOW + high + ABOVE, BELOW)
+    )
     unit = "px" if binning == 1 else "fine px"
     for ax in (above, below):
         ax.set(
@@ -71,7 +76,8 @@ def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -
         points.u, points.v, np.ma.masked_invalid(length), cmap=SIZES, vmin=0.0,
         shading="gouraud" if np.isfinite(length).all() else "nearest", rasterized=True,
     )  # fmt: skip
-    fig.colorbar(image, ax=ax, label=f"displacement / {unit}", shrink=0.8)
+    bar = ax.inset_axes((1.04, 0.1, 0.04, 0.8))
+    fig.colorbar(image, cax=bar, label=f"displacement / {unit}")
     hatch(ax, points.hull)
     some = (slice(None, None, 2), slice(None, None, 2))
     shown = np.isfinite(length[some])

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics
@@ -17,10 +16,12 @@ from bayesfred.analysis.field import DisplacementField
 from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.field import field_plot
-from bayesfred.reporting.frames import MAX_STARS, FittedFrame, frame_triptych, star_panels
+from bayesfred.reporting.frames import MAX_STARS, FittedFrame, star_panels
 from bayesfred.reporting.goodness import described_residuals, residual_panels
-from bayesfred.reporting.posteriors import corner_plot, marginal_plot, trace_plot
+from bayesfred.reporting.pairs import corner_plot, described_pairs, pairs_caption
+from bayesfred.reporting.posteriors import marginal_plot, trace_plot
 from bayesfred.reporting.psf import described_psf, psf_panels
+from bayesfred.reporting.style import png
 from bayesfred.sampling.chain import Chain
 
 __all__ = ["PageFigure", "described_residual", "page_figures"]
@@ -37,13 +38,14 @@ class PageFigure(NamedTuple):
         What stands above and below it.
     alternative : str
         What is seen in it, for those who do not see it.
-    figure : Figure
+    content : bytes
+        The PNG file.
     """
 
     heading: str
     caption: str
     alternative: str
-    figure: Figure
+    content: bytes
 
 
 def page_figures(
@@ -52,6 +54,7 @@ def page_figures(
     diagnostics: Diagnostics,
     field: DisplacementField,
     *,
+    picture: bytes,
     shown: Sequence[int],
     truth: Floats | None = None,
 ) -> list[PageFigure]:
@@ -66,6 +69,8 @@ def page_figures(
         What `diagnose` said of `chain`.
     field : DisplacementField
         Of the chain; its figure comes first.
+    picture : bytes
+        The PNG file of `bayesfred.reporting.posteriors.overview`.
     shown : sequence of int
         Indices of the parameters that are shown in pairs; the others have histograms.
     truth : ndarray, shape (d,), parameter units, optional
@@ -87,20 +92,21 @@ def page_figures(
             "arrows that agree with their neighbours mean a missing term. The longest arrows are "
             "left out; a cross stands for one of more than 3 standard deviations.",
             field.message,
-            field_plot(field, diagnostics.sources, posterior.model.detector.binning),
+            png(field_plot(field, diagnostics.sources, posterior.model.detector.binning)),
         ),
         PageFigure(
             "Frame, model and residual",
-            "At the MAP. Green pixels do not enter the likelihood.",
+            "At the MAP. Green pixels do not enter the likelihood. Below: how many standard "
+            f"deviations the posterior is away from {'zero' if truth is None else 'the truth'}.",
             f"{_described_frame(fitted)} {described_residual(fitted)}",
-            frame_triptych(fitted),
+            picture,
         ),
         PageFigure(
             "Brightest sources",
             "Labelled with u, v in pixels from the middle. A dipole in a residual is a misplaced "
             "source.",
             _described_stars(fitted, u, v),
-            star_panels(fitted, u, v, half_width=half_width),
+            png(star_panels(fitted, u, v, half_width=half_width)),
         ),
         *_psf_figures(posterior),
         *_residual_figures(diagnostics, posterior),
@@ -113,7 +119,7 @@ def page_figures(
                 "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, "
                 "flat at 1 when all ensembles sample one distribution.",
                 _described_chain(chain, diagnostics),
-                trace_plot(chain, posterior.parameters),
+                png(trace_plot(chain, posterior.parameters), shades=False),
             )
         )
     return figures
@@ -131,7 +137,7 @@ def _psf_figures(posterior: Posterior) -> list[PageFigure]:
             f"posterior. {psf.determined:.0f} numbers of it are determined by the counts; it "
             f"leaves {psf.model_error:.1%} of the light unexplained.",
             described_psf(psf),
-            psf_panels(psf, posterior.model.detector.shape),
+            png(psf_panels(psf, posterior.model.detector.shape)),
         )
     ]
 
@@ -146,7 +152,7 @@ def _residual_figures(diagnostics: Diagnostics, posterior: Posterior) -> list[Pa
             "Their distribution beside that of a true model, the displacement of the sources "
             "against the position of their images within a pixel, and every source's chi-square.",
             described_residuals(diagnostics.residuals),
-            residual_panels(diagnostics.residuals, posterior.model.detector.shape),
+            png(residual_panels(diagnostics.residuals, posterior.model.detector.shape)),
         )
     ]
 
@@ -156,28 +162,14 @@ def _posterior_figures(
 ) -> list[PageFigure]:
     """Pairs of the parameters that are shown so, and histograms of the others."""
     draws, posterior = chain.draws(), chain.posterior()
+    estimate, parameters = chain.estimate.params, posterior.parameters
     rest = [k for k in range(draws.shape[1]) if k not in shown]
-
-    def part(which: Sequence[int], values: Floats | None) -> Floats | None:
-        return None if values is None else values[list(which)]
-
-    def marks(which: Sequence[int]) -> dict[str, Floats | None]:
-        return {"truth": part(which, truth), "estimate": part(which, chain.estimate.params)}
-
-    caption = "Contours hold 39 % and 86 % of the draws."
-    if rest:
-        caption += (
-            f" {len(shown)} of {draws.shape[1]} parameters: report --corner NAME,NAME,... shows "
-            "others."
-        )
     figures = [
         PageFigure(
             "Posterior",
-            caption,
-            _described_pairs(draws, chain.parameter_names, shown),
-            corner_plot(
-                draws[:, list(shown)], [posterior.parameters[k] for k in shown], **marks(shown)
-            ),
+            pairs_caption(len(shown), draws.shape[1]),
+            described_pairs(draws, chain.parameter_names, shown),
+            png(corner_plot(draws, parameters, shown=shown, truth=truth, estimate=estimate)),
         )
     ]
     if rest:
@@ -187,9 +179,12 @@ def _posterior_figures(
                 "Posterior: other parameters",
                 "Draws, and the density of the prior: next to zero where the prior is much wider.",
                 _described_marginals(draws[:, rest], names, posterior),
-                marginal_plot(
-                    draws[:, rest], [posterior.parameters[k] for k in rest], posterior.prior,
-                    **marks(rest),
+                png(
+                    marginal_plot(
+                        draws[:, rest], [parameters[k] for k in rest], posterior.prior,
+                        truth=None if truth is None else truth[rest], estimate=estimate[rest],
+                    ),
+                    shades=False,
                 ),
             )
         )  # fmt: skip
@@ -243,19 +238,6 @@ def _described_stars(fitted: FittedFrame, u: Floats, v: Floats) -> str:
         f"the {number} brightest of {inside} sources" if inside > number else f"{number} sources"
     )
     return f"Counts, model and residual side by side around {which} in the frame."
-
-
-def _described_pairs(draws: Floats, names: Sequence[str], shown: Sequence[int]) -> str:
-    text = f"Histograms of {len(shown)} parameters and contours of their pairs."
-    if len(shown) < 2:
-        return text
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.atleast_2d(np.nan_to_num(np.corrcoef(draws[:, list(shown)].T)))
-    i, j = divmod(int(np.argmax(np.abs(np.triu(correlation, 1)))), len(shown))
-    number = f"{correlation[i, j]:+.2f}".replace("-", "−")
-    return (
-        f"{text} The strongest correlation is {number}, of {names[shown[i]]} and {names[shown[j]]}."
-    )
 
 
 def _described_marginals(draws: Floats, names: Sequence[str], posterior: Posterior) -> str:

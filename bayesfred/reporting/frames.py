@@ -20,11 +20,11 @@ from matplotlib.image import AxesImage
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.posterior import Posterior
+from bayesfred.reporting.panels import Sheet
 
 __all__ = [
     "FittedFrame",
     "draw_triptych",
-    "frame_triptych",
     "residual_panels",
     "star_panels",
     "triptych_height",
@@ -34,8 +34,10 @@ __all__ = [
 COUNTS_MAP, RESIDUAL_MAP = "gray_r", "RdBu_r"
 MASKED = "#cfe3bf"  # a colour that neither map has
 RESIDUAL_LIMIT = 5.0
-TRIPTYCH_MARGIN, TRIPTYCH_SIDE = 0.7, 5.6
+SIDE = 5.0  # inch of a frame's longer side, and of what stands around it
+LEFT, BELOW, ABOVE = 0.85, 0.65, 0.4
 MAX_STARS = 24
+STAMP = 1.25  # inch
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +80,6 @@ class FittedFrame:
         return out
 
 
-def frame_triptych(fitted: FittedFrame) -> Figure:
-    """The frame, the model on the same scale, and their difference in standard deviations.
-
-    Parameters
-    ----------
-    fitted : FittedFrame
-
-    Returns
-    -------
-    Figure
-    """
-    fig = Figure(figsize=(19, triptych_height(fitted)), dpi=100, layout="constrained")
-    draw_triptych(fig, fig.subplots(1, 3), fitted)
-    return fig
-
-
 def residual_panels(frames: Sequence[FittedFrame]) -> Figure:
     """Residuals of several models, three in a row, on one scale and numbered from 1.
 
@@ -107,20 +93,22 @@ def residual_panels(frames: Sequence[FittedFrame]) -> Figure:
     """
     columns = min(len(frames), 3)
     rows = -(-len(frames) // columns)
-    height = rows * max(triptych_height(frame) for frame in frames)
-    fig = Figure(figsize=(6.2 * columns + 0.8, height), dpi=100, layout="constrained")
-    axes = fig.subplots(rows, columns, squeeze=False).ravel()
-    for k, (ax, fitted) in enumerate(zip(axes, frames, strict=False), 1):
+    high = max(triptych_height(frame) for frame in frames)
+    width, height = (LEFT + SIDE) * columns + 1.1, rows * high
+    fig = Figure(figsize=(width, height), dpi=100)
+    for k, fitted in enumerate(frames):
+        left = LEFT + (LEFT + SIDE) * (k % columns)
+        bottom = BELOW + high * (rows - 1 - k // columns)
+        ax = _axes(fig, (left, bottom, high - BELOW - ABOVE))
         ny, nx = fitted.counts.shape
         extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
         image = _show(ax, fitted.residual(), _sigma_norm(), RESIDUAL_MAP, extent)
-        ax.set_title(f"run {k}", fontsize=15)
+        ax.set_title(f"run {k + 1}", fontsize=15)
         ax.set_xlabel("u / pixel", fontsize=13)
         ax.set_ylabel("v / pixel", fontsize=13)
         ax.tick_params(labelsize=12)
-    for ax in axes[len(frames) :]:
-        ax.set_visible(False)
-    fig.colorbar(image, ax=list(axes)).set_label("residual / sigma", fontsize=13)
+    bar = fig.add_axes((1.0 - 0.95 / width, BELOW / height, 0.2 / width, 1.0 - 1.1 / height))
+    fig.colorbar(image, cax=bar).set_label("residual / sigma", fontsize=13)
     return fig
 
 
@@ -145,57 +133,59 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
     """
     ny, nx = fitted.counts.shape
     # a source without an image has the position nan, far outside for what follows
-    column, row = (
+    column, row_of = (
         np.rint(np.nan_to_num(position, nan=-1e9) + (n - 1) / 2).astype(int)
         for position, n in ((u, nx), (v, ny))
     )
-    inside = np.flatnonzero((column >= 0) & (column < nx) & (row >= 0) & (row < ny))
+    inside = np.flatnonzero((column >= 0) & (column < nx) & (row_of >= 0) & (row_of < ny))
     stamp = partial(_stamp, half_width=half_width)
-    light = [float(np.nansum(stamp(fitted.expected, column[s], row[s]))) for s in inside]
+    light = [float(np.nansum(stamp(fitted.expected, column[s], row_of[s]))) for s in inside]
     shown = inside[np.argsort(light, kind="stable")[::-1][:MAX_STARS]]
     blocks = 1 if shown.size < 3 else 3
     rows = max(-(-shown.size // blocks), 1)
-    fig = Figure(figsize=(1.0 + 4.1 * blocks, 0.75 + 1.35 * rows), dpi=100)
+    sheet = Sheet(1.0 + 4.1 * blocks, 0.55 + (STAMP + 0.07) * rows)
     if not shown.size:
-        fig.text(0.5, 0.5, "no source lies in the frame", ha="center", va="center")
-        return fig
+        sheet.text(
+            0.5 * sheet.width, 0.5 * sheet.height, "no source lies in the frame", ha="center"
+        )
+        return sheet.finish()
     layers = (fitted.recorded(), fitted.expected, fitted.residual())
-    width, height = fig.get_size_inches()
-    outer = fig.add_gridspec(
-        1,
-        blocks,
-        left=0.01,
-        right=1 - 0.75 / width,
-        bottom=0.01,
-        top=1 - 0.42 / height,
-        wspace=0.06,
+    for k, s in enumerate(shown):
+        block, row = divmod(k, rows)
+        data, model, difference = (stamp(layer, column[s], row_of[s]) for layer in layers)
+        norm = _stretch(data, model)
+        left, bottom = 0.12 + 4.1 * block, 0.1 + (STAMP + 0.07) * (rows - 1 - row)
+        for c, (values, scale, colours) in enumerate(
+            ((data, norm, COUNTS_MAP), (model, norm, COUNTS_MAP),
+             (difference, _sigma_norm(), RESIDUAL_MAP))
+        ):  # fmt: skip
+            box = (left + c * (STAMP + 0.05), bottom, STAMP, STAMP)
+            sheet.panel(box, (0.0, 1.0), (0.0, 1.0))
+            shown_values = scale(np.ma.masked_invalid(values))
+            sheet.image(box, _colours(colours)(shown_values, bytes=True))
+            if row == 0:
+                title = ("counts", "model", "residual")[c]
+                sheet.text(
+                    box[0] + 0.5 * STAMP, box[1] + STAMP + 0.06, title, ha="center", fontsize=10
+                )
+        position = f"{round(u[s]):+d}, {round(v[s]):+d}".replace("-", "−")
+        sheet.text(left + STAMP + 0.1, bottom + STAMP - 0.06, position, va="top", fontsize=8.5)
+    bar = sheet.panel(
+        (sheet.width - 0.65, 0.1, 0.14, sheet.height - 0.5),
+        (0.0, 1.0), (-RESIDUAL_LIMIT, RESIDUAL_LIMIT),
+    )  # fmt: skip
+    sheet.image(bar.box, colormaps[RESIDUAL_MAP](np.linspace(0.0, 1.0, 201)[:, None], bytes=True))
+    bar.ticks_beside(right=True)
+    sheet.text(
+        sheet.width - 0.08,
+        0.5 * sheet.height,
+        "residual / sigma",
+        rotation=90,
+        ha="right",
+        va="center",
+        fontsize=10,
     )
-    for b in range(blocks):
-        grid = outer[b].subgridspec(rows, 3, wspace=0.03, hspace=0.06)
-        for r, s in enumerate(shown[b * rows : (b + 1) * rows]):
-            data, model, difference = (stamp(layer, column[s], row[s]) for layer in layers)
-            norm = _stretch(data, model)
-            axes = [fig.add_subplot(grid[r, c]) for c in range(3)]
-            _show(axes[0], data, norm, COUNTS_MAP)
-            _show(axes[1], model, norm, COUNTS_MAP)
-            last = _show(axes[2], difference, _sigma_norm(), RESIDUAL_MAP)
-            position = f"{u[s]:+.0f}, {v[s]:+.0f}"
-            axes[1].text(
-                0.04,
-                0.96,
-                position,
-                transform=axes[1].transAxes,
-                va="top",
-                color="black",
-                fontsize=8.5,
-            )
-            for ax, title in zip(axes, ("counts", "model", "residual"), strict=True):
-                ax.set(xticks=[], yticks=[])
-                if r == 0:
-                    ax.set_title(title, fontsize=10)
-    bar = fig.add_axes((1 - 0.65 / width, 0.04, 0.14 / width, 0.86))
-    fig.colorbar(last, cax=bar, label="residual / sigma")
-    return fig
+    return sheet.finish()
 
 
 def triptych_height(fitted: FittedFrame) -> float:
@@ -210,20 +200,23 @@ def triptych_height(fitted: FittedFrame) -> float:
     float, inch
     """
     ny, nx = fitted.counts.shape
-    return TRIPTYCH_MARGIN + TRIPTYCH_SIDE * min(max(float(ny / nx), 0.25), 2.0)
+    return BELOW + ABOVE + SIDE * min(max(float(ny / nx), 0.25), 2.0)
 
 
-def draw_triptych(fig: Figure, axes: Sequence[Axes], fitted: FittedFrame) -> None:
-    """Show frame, model and residual on three axes; the first two share a colour bar.
+def draw_triptych(fig: Figure, fitted: FittedFrame) -> None:
+    """Show frame, model and residual at the top of a figure; the first two share a colour bar.
 
     Parameters
     ----------
     fig : Figure
-    axes : sequence of Axes, length 3
+        19 inches wide.
     fitted : FittedFrame
     """
     ny, nx = fitted.counts.shape
     extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
+    height = triptych_height(fitted) - BELOW - ABOVE
+    bottom = fig.get_figheight() - height - ABOVE
+    axes = [_axes(fig, (left, bottom, height)) for left in (LEFT, 6.55, 13.05)]
     norm = _stretch(fitted.counts[fitted.mask], fitted.expected[fitted.mask])
     _show(axes[0], fitted.recorded(), norm, COUNTS_MAP, extent)
     _show(axes[1], fitted.expected, norm, COUNTS_MAP, extent)
@@ -247,19 +240,29 @@ def draw_triptych(fig: Figure, axes: Sequence[Axes], fitted: FittedFrame) -> Non
         ax.tick_params(labelsize=12)
 
 
+def _axes(fig: Figure, place: tuple[float, float, float]) -> Axes:
+    """Axes of a frame, given by left, bottom and height in inches."""
+    (width, height), (left, bottom, high) = fig.get_size_inches(), place
+    return fig.add_axes((left / width, bottom / height, SIDE / width, high / height))
+
+
 def _show(
     ax: Axes,
     frame: Floats,
     norm: Normalize,
     colours: str,
-    extent: tuple[float, float, float, float] | None = None,
+    extent: tuple[float, float, float, float],
 ) -> AxesImage:
     """An image, green where it is not finite; unsmoothed, so that noise stays noise."""
-    cmap: Colormap = colormaps[colours].with_extremes(bad=MASKED)
-    image = np.ma.masked_invalid(frame)
     return ax.imshow(
-        image, cmap=cmap, norm=norm, extent=extent, origin="lower", interpolation="nearest"
-    )
+        np.ma.masked_invalid(frame), cmap=_colours(colours), norm=norm, extent=extent,
+        origin="lower", interpolation="nearest",
+    )  # fmt: skip
+
+
+def _colours(name: str) -> Colormap:
+    """A map of colours, green where a value is not finite."""
+    return colormaps[name].with_extremes(bad=MASKED)
 
 
 def _sigma_norm() -> Normalize:

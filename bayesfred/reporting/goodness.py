@@ -34,8 +34,9 @@ def residual_panels(residuals: Residuals, shape: tuple[int, int]) -> Figure:
     -------
     Figure
     """
-    fig = Figure(figsize=(15, 4.6), dpi=100, layout="constrained")
+    fig = Figure(figsize=(15, 4.6), dpi=100)
     axes = fig.subplots(1, 3)
+    fig.subplots_adjust(left=0.05, right=0.93, bottom=0.12, top=0.92, wspace=0.3)
     _draw_pit(axes[0], residuals.pit)
     _draw_phase(axes[1], residuals.phases)
     _draw_sources(fig, axes[2], residuals, shape)
@@ -109,7 +110,8 @@ def _draw_sources(fig: Figure, ax: Axes, residuals: Residuals, shape: tuple[int,
         table["u"][failed], table["v"][failed], s=260, facecolors="none", edgecolors="black",
         linewidths=1.3,
     )  # fmt: skip
-    fig.colorbar(points, ax=ax, label="chi-square: excess / sd", extend="both", shrink=0.9)
+    bar = ax.inset_axes((1.03, 0.05, 0.04, 0.9))
+    fig.colorbar(points, cax=bar, label="chi-square: excess / sd", extend="both")
     ax.set(
         xlim=(-nx / 2, nx / 2), ylim=(-ny / 2, ny / 2), aspect="equal", xlabel="u / pixel",
         ylabel="v / pixel", title="Sources (ringed: do not fit)" if failed.size else "Sources",

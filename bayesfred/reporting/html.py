@@ -225,7 +225,7 @@ def embedded_figures(figures: Sequence[PageFigure]) -> list[dict[str, Any]]:
     -------
     list of dict
     """
-    return [{**f._asdict(), "image": embedded(f.figure)} for f in figures]
+    return [{**f._asdict(), "image": embedded(f.content)} for f in figures]
 
 
 def described_model(record: RunRecord, posterior: Posterior) -> str:

@@ -29,8 +29,9 @@ from bayesfred.reporting.html import (
     render,
 )
 from bayesfred.reporting.labels import axis_label, html_symbols, power_of_ten
-from bayesfred.reporting.posteriors import corner_plot, trace_plot
-from bayesfred.reporting.style import POSTERIOR_COLOUR, TRUTH_COLOUR
+from bayesfred.reporting.pairs import corner_plot, described_pairs, pairs_caption
+from bayesfred.reporting.posteriors import trace_plot
+from bayesfred.reporting.style import POSTERIOR_COLOUR, TRUTH_COLOUR, png
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.record import RunRecord
 
@@ -131,7 +132,7 @@ def _cell(value: float | np.bool_, form: str) -> str:
 
 
 def joint_figures(
-    chain: Chain, estimates: FrameEstimates, *, shown: Sequence[int]
+    chain: Chain, estimates: FrameEstimates, *, picture: bytes, shown: Sequence[int]
 ) -> list[PageFigure]:
     """The figures of the page of several frames.
 
@@ -141,6 +142,8 @@ def joint_figures(
         Of a `JointPosterior`.
     estimates : FrameEstimates
         Of its `shared` parameters.
+    picture : bytes
+        The PNG file of `agreement_plot`.
     shown : sequence of int
         Indices of the parameters shown in pairs.
 
@@ -150,12 +153,6 @@ def joint_figures(
     """
     posterior = chain.posterior()
     draws, parameters = chain.draws()[:, : posterior.n_shared], posterior.parameters
-    pairs = ""
-    if len(shown) < posterior.n_shared:
-        pairs = (
-            f"{len(shown)} of {posterior.n_shared} parameters: report --corner NAME,NAME,... shows "
-            "others."
-        )
     figures = [
         PageFigure(
             "Frames and what they share",
@@ -163,16 +160,19 @@ def joint_figures(
             "all frames together, with the standard deviation. Orange: more than "
             f"{FAR:.0f} standard deviations away.",
             _described(chain, estimates),
-            agreement_plot(estimates, parameters),
+            picture,
         ),
         PageFigure(
             "Posterior of what the frames share",
-            f"Contours hold 39 % and 86 % of the draws. {pairs}",
-            f"Histograms of {len(shown)} parameters and contours of their pairs.",
-            corner_plot(
-                draws[:, list(shown)],
-                [parameters[k] for k in shown],
-                estimate=chain.estimate.params[list(shown)],
+            pairs_caption(len(shown), posterior.n_shared),
+            described_pairs(draws, chain.parameter_names[: posterior.n_shared], shown),
+            png(
+                corner_plot(
+                    draws,
+                    parameters[: posterior.n_shared],
+                    shown=shown,
+                    estimate=chain.estimate.params[: posterior.n_shared],
+                )
             ),
         ),
     ]
@@ -184,7 +184,7 @@ def joint_figures(
                 "Median and middle 68 % of each ensemble's walkers; histograms of their ranks, "
                 "flat at 1 when all ensembles sample one distribution.",
                 f"Traces and rank histograms of {posterior.n_shared} parameters.",
-                trace_plot(common, parameters[: posterior.n_shared]),
+                png(trace_plot(common, parameters[: posterior.n_shared]), shades=False),
             )
         )
     return figures

@@ -22,9 +22,12 @@ __all__ = [
     "html_unit",
     "math_symbol",
     "power_of_ten",
+    "raised",
     "scale_of",
     "with_error",
 ]
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -170,13 +173,32 @@ def axis_label(parameter: Parameter, exponent: int, separator: str = " ") -> str
     --------
     >>> from types import SimpleNamespace
     >>> axis_label(SimpleNamespace(name="psf_sigma", letter="", unit="", pixels=1), -2)
-    'psf sigma [$10^{-2}$ px]'
+    'psf sigma [10⁻² px]'
     """
-    pixels = parameter.pixels
-    pixel = "" if pixels == 0 else "px" if pixels == 1 else f"px$^{{{pixels}}}$"
-    power = f"$10^{{{exponent}}}$" if exponent else ""
+    pixel = raised("px", parameter.pixels) if parameter.pixels else ""
+    power = raised("10", exponent) if exponent else ""
     unit = " ".join(part for part in (power, parameter.unit, pixel) if part)
     return math_symbol(parameter) + (f"{separator}[{unit}]" if unit else "")
+
+
+def raised(base: str, power: int) -> str:
+    """A power in the characters that Unicode has for it, which take no typesetting.
+
+    Parameters
+    ----------
+    base : str
+    power : int
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> raised("px", -2), raised("px", 1)
+    ('px⁻²', 'px')
+    """
+    return base if power == 1 else base + str(power).translate(_SUPERSCRIPTS)
 
 
 def html_symbol(parameter: Parameter) -> Markup:

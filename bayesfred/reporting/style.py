@@ -2,8 +2,11 @@
 
 import base64
 import io
-from typing import NamedTuple
+import struct
+from typing import Any, NamedTuple
 
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -32,14 +35,19 @@ ENSEMBLE_COLOURS = (
 )
 
 
-def png(figure: Figure, dpi: int = 150) -> bytes:
+def png(figure: Figure, dpi: int = 100, *, shades: bool = True) -> bytes:
     """Render a figure as a PNG file's content.
+
+    It has 256 colours, which makes it a third as large as one of all colours.
 
     Parameters
     ----------
     figure : Figure
     dpi : int
         Dots an inch.
+    shades : bool
+        Whether its colours are chosen for the shades of images and scales; those of lines and areas
+        alone are found five times as fast.
 
     Returns
     -------
@@ -50,8 +58,15 @@ def png(figure: Figure, dpi: int = 150) -> bytes:
     >>> png(Figure(figsize=(1, 1)))[1:4]
     b'PNG'
     """
+    figure.set(dpi=dpi, facecolor="white")
+    canvas: Any = FigureCanvasAgg(figure)  # whose methods have no types
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    # the former of Pillow's methods keeps rare colours, such as those at a scale's ends
+    method = Image.Quantize.MAXCOVERAGE if shades else Image.Quantize.FASTOCTREE
+    few = image.quantize(256, method, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, facecolor="white")
+    few.save(buffer, "png")
     return buffer.getvalue()
 
 
@@ -63,14 +78,12 @@ class Embedded(NamedTuple):
     height: int
 
 
-def embedded(figure: Figure) -> Embedded:
-    """Render a figure as an image within a page.
-
-    It has 256 colours, which makes it a third as large as one of all colours.
+def embedded(content: bytes) -> Embedded:
+    """The content of a PNG file as an image within a page.
 
     Parameters
     ----------
-    figure : Figure
+    content : bytes
 
     Returns
     -------
@@ -78,15 +91,9 @@ def embedded(figure: Figure) -> Embedded:
 
     Examples
     --------
-    >>> embedded(Figure(figsize=(2, 1), dpi=100))[1:]
+    >>> embedded(png(Figure(figsize=(2, 1))))[1:]
     (200, 100)
     """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi="figure", facecolor="white")
-    image = Image.open(buffer)
-    # of Pillow's methods the one that keeps rare colours, such as those at a scale's ends
-    few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    buffer = io.BytesIO()
-    few.save(buffer, "png", optimize=True)
-    uri = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Embedded(uri, *image.size)
+    width, height = struct.unpack(">LL", content[16:24])  # of the file's first chunk
+    uri = "data:image/png;base64," + base64.b64encode(content).decode("ascii")
+    return Embedded(uri, width, height)
