@@ -129,12 +129,11 @@ def touch(boxes, s, t):
 
 
 @inner()
-def run_end(fp, s, i, at):
-    """The first of a source's rows after row i that does not continue the one before it.
+def run_end(fp, i, last, at):
+    """The first of a source's rows after row i, before `last`, that does not continue the others.
 
-    It continues it if it follows it both in its template and in an image.
+    A row continues the one before if it follows it both in its template and in an image.
     """
-    last = fp.first[s + 1]
     i += 1
     while i < last and at[i] == at[i - 1] + fp.size[i - 1]:
         i += 1
@@ -158,10 +157,14 @@ def copy(values, out):
 
 
 @inner()
-def _add_overlap(touching, s, t, weight, at, block):
-    """block[m, n] += sum over the pixels that sources s and t share of weight T_sm T_tn."""
+def add_overlap(touching, pair, weight, at, rows, block):
+    """block[m, n] += sum over the pixels that sources s and t share of weight T_sm T_tn.
+
+    Of rows first, first + step, ... of the frame, up to but for last.
+    """
     fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
-    for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
+    (s, t), (first, last, step) = pair, rows
+    for j in range(first, last, step):
         p = fp.first[s] + j - boxes[s, 0]
         q = fp.first[t] + j - boxes[t, 0]
         a = max(fp.low[p], fp.low[q])
@@ -173,6 +176,13 @@ def _add_overlap(touching, s, t, weight, at, block):
                 left = stamps[m, ps + a : ps + b]
                 for n in range(stamps.shape[0]):
                     block[m, n] += dot(left, stamps[n, qs + a : qs + b], part)
+
+
+@inner()
+def shared_rows(touching, s, t):
+    """The first row that two footprints share, and the one after the last."""
+    boxes = touching.boxes
+    return max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])
 
 
 @shared()
@@ -192,7 +202,7 @@ def gram(touching, group, weight, at, out):
             out[start[row] + group.lead[row] : start[row] + row + 1] = 0.0
         p = fp.first[s]
         while p < fp.first[s + 1]:
-            end = run_end(fp, s, p, at)
+            end = run_end(fp, p, fp.first[s + 1], at)
             first, last = fp.start[p], fp.start[end]
             for m in range(size):
                 for n in range(m + 1):
@@ -204,7 +214,8 @@ def gram(touching, group, weight, at, out):
         for k in range(group.lead[i * size] // size, i):
             if touch(touching.boxes, s, members[k]):
                 block[:] = 0.0
-                _add_overlap(touching, s, members[k], weight, at, block)
+                first, last = shared_rows(touching, s, members[k])
+                add_overlap(touching, (s, members[k]), weight, at, (first, last, 1), block)
                 for m in range(size):
                     row = start[i * size + m] + k * size
                     copy(block[m], out[row : row + size])
@@ -292,11 +303,11 @@ def solve(lower, group, x):
 
 
 @inner()
-def add_template(fp, s, template, amplitude, canvas):
-    """Add amplitude times one of a source's templates, shape (samples,), to a canvas."""
-    at, out, i = canvas.at, canvas.image, fp.first[s]
-    while i < fp.first[s + 1]:
-        end = run_end(fp, s, i, at)
+def add_template(fp, rows, template, amplitude, canvas):
+    """Add amplitude times rows of one of a source's templates, shape (samples,), to a canvas."""
+    at, out, i = canvas.at, canvas.image, rows[0]
+    while i < rows[1]:
+        end = run_end(fp, i, rows[1], at)
         stamp = template[fp.start[i] : fp.start[end]]
         target = out[at[i] : at[i] + stamp.size]
         for k in range(stamp.size):
@@ -310,21 +321,8 @@ def project(fp, s, template, image, at):
     total = 0.0
     i = fp.first[s]
     while i < fp.first[s + 1]:
-        end = run_end(fp, s, i, at)
+        end = run_end(fp, i, fp.first[s + 1], at)
         stamp = template[fp.start[i] : fp.start[end]]
         total += _inner(stamp, image[at[i] : at[i] + stamp.size])
-        i = end
-    return total
-
-
-@inner()
-def squared(fp, s, template, weight, at):
-    """Sum over a source's pixels of one of its templates squared times a weight."""
-    total = 0.0
-    i = fp.first[s]
-    while i < fp.first[s + 1]:
-        end = run_end(fp, s, i, at)
-        stamp = template[fp.start[i] : fp.start[end]]
-        total += dot(stamp, stamp, weight[at[i] : at[i] + stamp.size])
         i = end
     return total

@@ -95,7 +95,7 @@ def _fill_own(touching, s, flux, pixels, out):
     fp, stamp, at, sums = touching.footprints, touching.stamps[0], pixels.at, (0.0, 0.0, 0.0)
     i = fp.first[s]
     while i < fp.first[s + 1]:
-        end = run_end(fp, s, i, at)
+        end = run_end(fp, i, fp.first[s + 1], at)
         first, last = fp.start[i], fp.start[end]
         here = slice(at[i], at[i] + last - first)
         sums = own_run(stamp[first:last], pixels.weight[here], pixels.ratio[here], sums)

@@ -31,16 +31,13 @@ they say nothing, so that it is that of the prior, 1.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import inner, shared
-from bayesfred.imaging.kernels.contexts import Canvas, Layout
+from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import REDUCE
-from bayesfred.imaging.kernels.geometry import move, row_starts
-from bayesfred.imaging.kernels.render import add_source, add_templates
+from bayesfred.imaging.kernels.geometry import move
 from bayesfred.model.kernels.clusters import (
     DOF,
     SHARE,
@@ -56,66 +53,22 @@ from bayesfred.model.kernels.clusters import (
     project,
     shift_prior,
     solve,
-    squared,
 )
-from bayesfred.model.kernels.contexts import Group, Touching
 from bayesfred.model.kernels.expansion import Pixels, expand
+from bayesfred.model.kernels.flux_newton import (
+    Cluster,
+    make_templates,
+    maximize_fluxes,
+    start,
+)
 from bayesfred.model.kernels.likelihood import slope_run, stretch
 from bayesfred.model.kernels.noise_dispatch import exact_weight, given, sum_pixels
-from bayesfred.model.kernels.patches import Patch, fill_excess, new_patch, weigh_patch
+from bayesfred.model.kernels.patches import add_patch, fill_excess, new_patch, weigh_patch
 from bayesfred.model.kernels.shift_modes import other_mode
 
 LONGEST = 8.0  # Newton steps in one
 TRIES = 4  # other modes that are looked at in a cluster
 TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
-
-
-class _Cluster(NamedTuple):
-    """One cluster's sources, whose fluxes and shifts are looked for."""
-
-    layout: Layout
-    touching: Touching
-    group: Group
-    patch: Patch
-    canvas: Canvas  # the patch's image
-    fluxes: Floats
-    shifts: Floats
-    prior: Prior
-    scale: Floats  # of the fluxes' Gamma prior, the catalogue's flux over the shape
-
-
-@inner()
-def _make_templates(cluster, s, flux):
-    """Fill the templates of source s."""
-    stamps, fp = cluster.touching.stamps, cluster.layout.footprints
-    first, last = fp.first[s], fp.first[s + 1]
-    stamps[:, fp.start[first] : fp.start[last]] = 0.0
-    if stamps.shape[0] > 1:
-        add_templates(cluster.layout, s, flux, stamps, None)
-    else:
-        canvas = Canvas(stamps[0], fp.start)
-        add_source(cluster.layout, s, (first, last), 1.0, canvas, None)
-
-
-@inner()
-def _start(cluster):
-    """Templates, and the least-squares flux of every source, its neighbours ignored.
-
-    The prior counts as a measurement of its mean, 2 scale, with its variance, 2 scale^2: a source
-    without pixels, or with a few far in its wings, starts there.
-    """
-    fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
-    patch, canvas = cluster.patch, cluster.canvas
-    for s in cluster.group.members:
-        _make_templates(cluster, s, 1.0)
-        above = project(fp, s, stamps[0], patch.score, canvas.at)
-        below = squared(fp, s, stamps[0], patch.weight, canvas.at)
-        scale = cluster.scale[s]
-        fluxes[s] = max((above + 1.0 / scale) / (below + 0.5 / scale**2), 0.01 * scale)
-        for m in range(1, stamps.shape[0]):
-            for i in range(fp.start[fp.first[s]], fp.start[fp.first[s + 1]]):
-                stamps[m, i] *= fluxes[s]
-        add_template(fp, s, stamps[0], fluxes[s], canvas)
 
 
 @inner(error_model="numpy")
@@ -131,6 +84,55 @@ def _fill_gradient(cluster, out):
         else:
             _, weight = shift_prior(cluster.shifts[s], cluster.prior.scatter)
             out[i] -= weight * cluster.shifts[s, t - 1]
+
+
+@inner(error_model="numpy")
+def _relative(cluster, step, i):
+    """The largest relative change that a step makes in the flux and shift of source i."""
+    size, flux = cluster.touching.stamps.shape[0], cluster.fluxes[cluster.group.members[i]]
+    largest = abs(step[i * size]) / flux
+    for k in range(i * size + 1, (i + 1) * size):
+        largest = max(largest, abs(step[k]) / cluster.layout.sigma)
+    return largest
+
+
+@inner()
+def _change(cluster, s, flux, dx, dy):
+    """Change a source's flux and shift."""
+    fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
+    rows = fp.first[s], fp.first[s + 1]
+    add_template(fp, rows, stamps[0], -fluxes[s], cluster.canvas)
+    fluxes[s] += flux
+    cluster.shifts[s, 0] += dx
+    cluster.shifts[s, 1] += dy
+    move(cluster.layout.optics, cluster.layout.geometry, s, dx, dy)
+    make_templates(cluster, s, fluxes[s])
+    add_template(fp, rows, stamps[0], fluxes[s], cluster.canvas)
+
+
+@inner(error_model="numpy")
+def _take_step(cluster, step, shares, together):
+    """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`.
+
+    Returns the largest relative change of the whole step.
+    """
+    fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
+    fluxes, size, most = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0
+    for i in range(members.size):
+        largest = _relative(cluster, step, i)
+        most = max(most, largest)
+        if shares[i] * largest >= 0.5:
+            shares[i] = min(shares[i], 1.0 / (1.0 + largest))
+    if together:
+        shares[:] = shares.min()
+    for i in range(members.size):
+        s, own = members[i], shares[i] * step[i * size : (i + 1) * size]
+        if size > 1:
+            _change(cluster, s, own[0], own[1], own[2])
+        else:
+            fluxes[s] += own[0]
+            add_template(fp, (fp.first[s], fp.first[s + 1]), stamps[0], own[0], cluster.canvas)
+    return most
 
 
 @inner(fastmath=REDUCE, error_model="numpy")
@@ -175,54 +177,6 @@ def _factor(cluster, h, lower):
 
 
 @inner(error_model="numpy")
-def _relative(cluster, step, i):
-    """The largest relative change that a step makes in the flux and shift of source i."""
-    size, flux = cluster.touching.stamps.shape[0], cluster.fluxes[cluster.group.members[i]]
-    largest = abs(step[i * size]) / flux
-    for k in range(i * size + 1, (i + 1) * size):
-        largest = max(largest, abs(step[k]) / cluster.layout.sigma)
-    return largest
-
-
-@inner()
-def _change(cluster, s, flux, dx, dy):
-    """Change a source's flux and shift."""
-    fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
-    add_template(fp, s, stamps[0], -fluxes[s], cluster.canvas)
-    fluxes[s] += flux
-    cluster.shifts[s, 0] += dx
-    cluster.shifts[s, 1] += dy
-    move(cluster.layout.optics, cluster.layout.geometry, s, dx, dy)
-    _make_templates(cluster, s, fluxes[s])
-    add_template(fp, s, stamps[0], fluxes[s], cluster.canvas)
-
-
-@inner(error_model="numpy")
-def _take_step(cluster, step, shares, together):
-    """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`.
-
-    Returns the largest relative change of the whole step.
-    """
-    fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
-    fluxes, size, most = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0
-    for i in range(members.size):
-        largest = _relative(cluster, step, i)
-        most = max(most, largest)
-        if shares[i] * largest >= 0.5:
-            shares[i] = min(shares[i], 1.0 / (1.0 + largest))
-    if together:
-        shares[:] = shares.min()
-    for i in range(members.size):
-        s, own = members[i], shares[i] * step[i * size : (i + 1) * size]
-        if size > 1:
-            _change(cluster, s, own[0], own[1], own[2])
-        else:
-            fluxes[s] += own[0]
-            add_template(fp, s, stamps[0], own[0], cluster.canvas)
-    return most
-
-
-@inner(error_model="numpy")
 def _secant(gradient, step, distances, shares, most):
     """The shares of the next step, given the last one and the gradient where it led.
 
@@ -241,6 +195,8 @@ def _secant(gradient, step, distances, shares, most):
 def _maximize(frame, parameters, cluster, h):
     """Newton's iteration for a cluster; leaves Cholesky's factor of H in h. False if it fails."""
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
+    if touching.stamps.shape[0] == 1 and exact_weight(given(frame.noise, parameters)):
+        return maximize_fluxes(frame, parameters, cluster, h)
     size, noise = touching.stamps.shape[0], given(frame.noise, parameters)
     exact = exact_weight(noise)
     step, lower = np.zeros(group.lead.size), h.copy() if size > 1 else h
@@ -248,7 +204,7 @@ def _maximize(frame, parameters, cluster, h):
     shares, distances = np.ones(group.members.size), np.zeros(group.members.size)
     gradient = np.empty(step.size)
     for _ in range(100):
-        weigh_patch(frame, noise, parameters.background, patch, None)
+        weigh_patch(frame, noise, parameters.background, patch, (0, patch.first.size), None)
         fresh = converged or rate > 0.01  # otherwise the last matrix serves
         if fresh:
             gram(touching, group, patch.weight, at, h)
@@ -369,7 +325,7 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
     """
     touching, factors, shifts = profiled.touching, profiled.factors, profiled.shifts
     fp, clusters, size = layout.footprints, touching.clusters, touching.stamps.shape[0]
-    at, frame = np.empty(fp.row.size, np.int64), row_starts(fp, w.image.size // w.span.shape[0])
+    at = np.empty(fp.row.size, np.int64)
     shape, scatter = problem.shape, parameters.nuisances.position_scatter
     scale, value = problem.flux / shape, 0.0
     shifts[:] = 0.0
@@ -378,19 +334,19 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
         h = factors[clusters.begin[c] : clusters.begin[c + 1]]
         patch = new_patch(w, touching, group, at)
         canvas = Canvas(patch.image, at)
-        cluster = _Cluster(
+        cluster = Cluster(
             layout, touching, group, patch, canvas, fluxes, shifts, Prior(shape, scatter), scale
         )
         fill_excess(problem.frame, parameters.background, patch)
-        _start(cluster)
+        start(cluster)
         if not _climb(problem.frame, parameters, cluster, h):
             return -math.inf
         if np.any(touching.faint[group.members]):
             noise = given(problem.frame.noise, parameters)
-            weigh_patch(problem.frame, noise, parameters.background, patch, patch.ratio)
+            rows = 0, patch.first.size
+            weigh_patch(problem.frame, noise, parameters.background, patch, rows, patch.ratio)
             pixels = Pixels(patch.weight, patch.ratio, at)
             value += expand(touching, group, fluxes, shape, pixels)[0]
         value += _log_prior(cluster, h)
-        for s in group.members:
-            add_template(fp, s, touching.stamps[0], fluxes[s], Canvas(w.image, frame))
+        add_patch(patch, w.image)
     return value

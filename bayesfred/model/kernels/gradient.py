@@ -249,7 +249,7 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
         for i in range(part.size):
             s, t = group.members[i // size], i % size
             z[s, t] = part[i]
-            add_template(fp, s, stamps[t], part[i], Canvas(y, at))
+            add_template(fp, (fp.first[s], fp.first[s + 1]), stamps[t], part[i], Canvas(y, at))
             if t > 0:
                 d, (ratio, k) = shift[s, t - 1], shift_prior(shift[s], scatter)
                 moved = (SHARE * diagonal[i] + 2.0 * part[i] * d) / (1.0 + ratio)

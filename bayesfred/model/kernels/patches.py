@@ -54,9 +54,9 @@ def new_patch(w, touching, group, at):
 
 
 @shared()
-def weigh_patch(frame, noise, background, patch, ratios):
-    """Score and weight of a patch's pixels; their ratios into `ratios` unless it is None."""
-    for j in range(patch.first.size):
+def weigh_patch(frame, noise, background, patch, rows, ratios):
+    """Score and weight of rows of a patch; their ratios into `ratios` unless it is None."""
+    for j in range(rows[0], rows[1]):
         a, b = patch.start[j], patch.start[j + 1]
         part = stretch(frame, background, patch.top + j, patch.first[j], patch.image[a:b])
         ratio = None if ratios is None else ratios[a:b]
@@ -79,3 +79,12 @@ def fill_excess(frame, background, patch):
         a, b = patch.start[j], patch.start[j + 1]
         part = stretch(frame, background, patch.top + j, patch.first[j], patch.image[a:b])
         _excess_run(part, patch.score[a:b], patch.weight[a:b])
+
+
+@shared(fastmath=FAST)
+def add_patch(patch, image):
+    """Add a patch's image to that of the frame."""
+    for j in range(patch.first.size):
+        a, b, first = patch.start[j], patch.start[j + 1], patch.first[j]
+        for k in range(b - a):
+            image[first + k] += patch.image[a + k]
