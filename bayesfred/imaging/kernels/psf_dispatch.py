@@ -39,6 +39,9 @@ from numba.extending import overload
 
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 
+# Without wrappers for other callers, which take as long to compile as such a function itself.
+INLINED = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
 
 def by_type(choice: Callable[[Any], Callable[..., Any]]) -> Callable[..., Any]:
     """A function whose code is chosen by the named tuple class of its first argument."""
@@ -46,7 +49,7 @@ def by_type(choice: Callable[[Any], Callable[..., Any]]) -> Callable[..., Any]:
     def function(first: Any, *others: Any) -> Any:
         raise NotImplementedError("for compiled code")
 
-    @overload(function, inline="always", strict=False)
+    @overload(function, INLINED, inline="always", strict=False)
     def choose(first: Any, *others: Any) -> Any:
         return choice(first.instance_class)
 

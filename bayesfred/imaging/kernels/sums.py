@@ -173,8 +173,10 @@ def add_basis_sums(layout, basis, s, template, weight, buffers):
     if are_products(layout.optics.psf, layout.optics):
         lines = lines_of(layout.optics.psf, layout, s, first[s], first[s + 1])
         flux, by_a, by_b, wide = product_sums(lines, layout.footprints, s, template, weight)
-        out[:n_f] += by_a
-        out[n_f : n_f + n_g] += by_b
+        for k in range(n_f):
+            out[k] += by_a
+        for k in range(n_f, n_f + n_g):
+            out[k] += by_b
         out[n_f + n_g] += flux
         if widens(basis):
             out[n_f + n_g + 1] -= ((2.0 if template == 0 else 3.0) * flux + wide) / layout.sigma
