@@ -1,6 +1,7 @@
-"""What other packages reach on the same posterior: `python -m benchmarks.peers`.
+"""What other packages reach: `python -m benchmarks.peers`.
 
-It is that of the paper's frame, with 13 parameters and Poisson counts.
+First on the same posterior, that of the paper's frame, with 13 parameters and Poisson counts. Then,
+in `benchmarks.rivals`, other ways to the field: centroids, OpenCV, least squares.
 
 Each peer is written as a careful user of that package would, in float64, vectorised and compiled,
 evaluating every source on a stamp of the pixels where it exceeds 1e-8 of its peak:
@@ -206,6 +207,7 @@ def least_squares(stamps: Stamps, start: np.ndarray) -> float:
 
 
 def main() -> int:
+    from benchmarks import rivals
     from benchmarks.__main__ import THETA, model
 
     m = model()
@@ -251,6 +253,7 @@ def main() -> int:
         )
         table.add_row(name, *cells)
     Console(width=None if sys.stdout.isatty() else 110).print(table)
+    rivals.main()
     best = np.nanmax([rate for _, _, rate in rows[1:]])
     return 0 if rows[0][2] >= 100.0 * best else 1
 
