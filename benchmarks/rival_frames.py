@@ -129,13 +129,19 @@ def images(case: Case, parameters: Mapping[str, float], x: np.ndarray, y: np.nda
     return np.stack(case.lens.image_position(theta, x, y, offset=offset), axis=1)
 
 
-def field_deviations(case: Case, names: Sequence[str], covariance: np.ndarray) -> np.ndarray:
-    """Standard deviation of the images of POINTS, in which the lens's terms are linear."""
-    jacobian = np.zeros((len(POINTS), 2, len(names)))
+def jacobian(case: Case, names: Sequence[str], points: np.ndarray) -> np.ndarray:
+    """Of the images of object points, shape (n, 2, d): they are linear in the lens's terms."""
+    out = np.zeros((len(points), 2, len(names)))
     for k, unit in enumerate(np.eye(case.lens.n_terms)):
-        jacobian[:, :, k] = -np.stack(case.lens.displacement(unit, 0.0, 0.0, *POINTS.T), axis=1)
-    jacobian[:, 0, names.index("offset_x")] = jacobian[:, 1, names.index("offset_y")] = 1.0
-    return np.sqrt(np.einsum("ijk,kl,ijl->ij", jacobian, covariance, jacobian))
+        out[:, :, k] = -np.stack(case.lens.displacement(unit, 0.0, 0.0, *points.T), axis=1)
+    out[:, 0, names.index("offset_x")] = out[:, 1, names.index("offset_y")] = 1.0
+    return out
+
+
+def field_deviations(case: Case, names: Sequence[str], covariance: np.ndarray) -> np.ndarray:
+    """Standard deviation of the images of POINTS."""
+    along = jacobian(case, names, POINTS)
+    return np.sqrt(np.einsum("ijk,kl,ijl->ij", along, covariance, along))
 
 
 def _camera() -> bf.PolynomialDistortion:

@@ -8,7 +8,7 @@ and `curve_fit` do; so they know when centroids scatter more than their own erro
 
 - `fit_given`, `fit_free`, `fit_remedied`: this package, from the counts alone: with fluxes and PSF
   given; with free fluxes and width; with the PSF measured on the frame or, where the catalogue is
-  not complete, outliers rejected.
+  not complete, outliers rejected. `fit_from_places`: the first, told what the others are told.
 - `psf_photometry`: photutils' PSFPhotometry with a Gaussian PRF of the given width, groups of
   neighbours together; `epsf_photometry`: the same with the PSF of its EPSFBuilder.
 - `gaussian_centroids`: photutils' `centroid_2dg`; `windowed_centroids`: sep's `winpos`, on stars
@@ -38,6 +38,7 @@ from benchmarks.rival_frames import (
     field_deviations,
     forward_model,
     images,
+    jacobian,
 )
 
 OUTLIER = 4.0  # robust standard deviations
@@ -89,6 +90,16 @@ def _found(case: Case, posterior: bf.Posterior, estimate: bf.MapEstimate) -> Fou
 def fit_given(frame: Frame) -> Found:
     posterior = _posterior(frame, bf.Nuisances(offset=True))
     return _found(frame.case, posterior, bf.find_map(posterior))
+
+
+def fit_from_places(frame: Frame) -> Found:
+    posterior = _posterior(frame, bf.Nuisances(offset=True))
+    names = posterior.parameter_names
+    plain = np.stack([frame.catalog.x, frame.catalog.y], axis=1)
+    along = jacobian(frame.case, names, plain).reshape(-1, len(names))
+    start = np.linalg.lstsq(along, (frame.places - plain).ravel(), rcond=None)[0]
+    start[names.index("background")] = np.median(frame.counts)
+    return _found(frame.case, posterior, bf.find_map(posterior, start))
 
 
 def fit_free(frame: Frame) -> Found:
