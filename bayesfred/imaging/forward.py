@@ -170,7 +170,7 @@ class ForwardModel:
                 q=(0,) * (2 * degree),
                 d=(0,) * (2 * degree - 1) if self.conserve_flux else (),
             ),
-            translates=not np.concatenate([f, g])[:, 2:].any(),
+            translates=None if np.concatenate([f, g])[:, 2:].any() else True,
         )
 
     @cached_property

@@ -1,6 +1,6 @@
 """The tuples that the loops pass to each other: s counts sources, k terms."""
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from bayesfred._typing import Floats, Ints
 
@@ -35,7 +35,9 @@ class Optics(NamedTuple):
     support_radius: float  # (a, b) that lie farther from 0 are below the tolerance, sigma
     ramp: Floats  # (padded row,) u of pixels counted from a row's first
     degrees: Degrees
-    translates: bool  # whether every source's map is a translation: f and g without u and v
+    # whether every source's map is a translation, f and g without u and v; None where not: a type
+    # of its own, for which what renders products is not compiled
+    translates: Literal[True] | None
 
 
 class SourceNuisances(NamedTuple):

@@ -21,7 +21,6 @@ from bayesfred.imaging.kernels.geometry import (
 )
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.products import (
-    are_products,
     fill_second_derivatives,
     lines_of,
     product_basis_row,
@@ -320,8 +319,8 @@ def second_derivatives(layout, rows, s, flux):
     first, last = fp.first[s], fp.first[s + 1]
     source, begin = one_source(layout.geometry, s), fp.start[first]
     second = np.empty((3, fp.start[last] - begin))
-    if are_products(o.psf, o):
-        fill_second_derivatives(lines_of(o.psf, layout, s, first, last), fp, s, flux, second)
+    lines = lines_of(o.translates, o.psf, layout, s, first, last)
+    if fill_second_derivatives(lines, fp, s, flux, second):
         return second
     for p in range(first, last):
         n, own = fp.size[p], fp.start[p] - begin
@@ -347,19 +346,16 @@ def add_jacobian_rows(layout, basis, flux, first, last, out):
         1.0 / layout.sigma,
         (len(rows.f), len(rows.g), rows.is_wider),
     )
-    products = are_products(o.psf, o)
     for s in range(flux.size):
         if reached[s, 0] >= last or reached[s, 1] <= first:
             continue
         source = one_source(layout.geometry, s)
-        lines = lines_of(o.psf, layout, s, begins[s], begins[s + 1] if products else begins[s])
+        lines = lines_of(o.translates, o.psf, layout, s, begins[s], begins[s + 1])
         for p in range(begins[s], begins[s + 1]):
             j, low, n = numbers[p], lows[p], sizes[p]
             if not first <= j < last:
                 continue
-            if products:
-                product_basis_row(lines, monomials, inverse, j, low, basis_rows[:, :n])
-            else:
+            if not product_basis_row(lines, monomials, inverse, j, low, basis_rows[:, :n]):
                 u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
                 basis_row(rows, source, u, v, n, np.int64(0))
             for k in range(index.size):

@@ -89,7 +89,9 @@ def _set_line(line, factor, out):
 
 @shared()
 def add_product(lines, fp, rows, flux, canvas, alone):
-    """Do what `render.add_source` does."""
+    """Do what `render.add_source` does; False without lines."""
+    if lines is None:
+        return False
     f, top, low, out, at = lines.rows[0], lines.top, lines.low, canvas.image, canvas.at
     lows, sizes, js = fp.low, fp.size, fp.row
     for i in range(rows[0], rows[1]):
@@ -98,11 +100,14 @@ def add_product(lines, fp, rows, flux, canvas, alone):
         _add_line(line, factor, out[at[i] : at[i] + n])
         if alone is not None:
             _set_line(line, factor, alone.image[alone.at[i] : alone.at[i] + n])
+    return True
 
 
 @shared()
 def add_product_templates(lines, fp, s, flux, stamps, wider):
-    """Do what `render.add_templates` does."""
+    """Do what `render.add_templates` does; False without lines."""
+    if lines is None:
+        return False
     for i in range(fp.first[s], fp.first[s + 1]):
         a, b = lines.columns[:, fp.low[i] - lines.low :], lines.rows[:, fp.row[i] - lines.top]
         own = slice(fp.start[i], fp.start[i + 1])
@@ -111,6 +116,7 @@ def add_product_templates(lines, fp, s, flux, stamps, wider):
         _add_line(a[0], flux * b[1], stamps[2, own])
         if wider is not None:
             _add_two(a[3], flux * b[0], a[0], flux * (b[3] - 2.0 * b[0]), wider[own])
+    return True
 
 
 @shared()
@@ -118,8 +124,10 @@ def product_basis_row(lines, basis, inverse, j, low, out):
     """The rows of a basis on row j from column `low` on, see `jacobian.basis_row`.
 
     `basis` are the numbers of monomials of f and of g, each of which is 1, and whether the width is
-    a parameter.
+    a parameter. Returns False without lines.
     """
+    if lines is None:
+        return False
     n_f, n_g, is_wider = basis
     a, b = lines.columns[:, low - lines.low :], lines.rows[:, j - lines.top]
     for k in range(n_f):
@@ -131,11 +139,14 @@ def product_basis_row(lines, basis, inverse, j, low, out):
         row = out[n_f + n_g + 1]
         row[:] = 0.0
         _add_two(a[3], inverse * b[0], a[0], inverse * (b[3] - 2.0 * b[0]), row)
+    return True
 
 
 @shared()
 def fill_second_derivatives(lines, fp, s, flux, out):
-    """Do what `jacobian.second_derivatives` does."""
+    """Do what `jacobian.second_derivatives` does; False without lines."""
+    if lines is None:
+        return False
     begin = fp.start[fp.first[s]]
     for i in range(fp.first[s], fp.first[s + 1]):
         own = slice(fp.start[i] - begin, fp.start[i + 1] - begin)
@@ -143,6 +154,7 @@ def fill_second_derivatives(lines, fp, s, flux, out):
         _set_line(a[2], flux * b[0], out[0, own])
         _set_line(a[1], flux * b[1], out[1, own])
         _set_line(a[0], flux * b[2], out[2, own])
+    return True
 
 
 @inner(fastmath=REDUCE)
@@ -157,7 +169,12 @@ def _three_dots(weight, first, second, third):
 
 @shared()
 def product_sums(lines, fp, s, template, weight):
-    """Sums of a weight times P, P_a, P_b and a P_a + b P_b over the pixels of source s."""
+    """Sums of a weight times P, P_a, P_b and a P_a + b P_b over the pixels of source s.
+
+    Returns whether there are lines before them.
+    """
+    if lines is None:
+        return False, 0.0, 0.0, 0.0, 0.0
     total, by_a, by_b, wide = 0.0, 0.0, 0.0, 0.0
     p, q = (1 if template == 1 else 0), (1 if template == 2 else 0)
     begin = fp.start[fp.first[s]]
@@ -169,7 +186,7 @@ def product_sums(lines, fp, s, template, weight):
         by_a -= slope * b[q]
         by_b -= one * b[q + 1]
         wide -= product * b[q] + one * b[q + 3]
-    return total, by_a, by_b, wide
+    return True, total, by_a, by_b, wide
 
 
 def _lines_of(psf, layout, s, first, last):
@@ -177,18 +194,19 @@ def _lines_of(psf, layout, s, first, last):
 
 
 def _no_lines(psf, layout, s, first, last):
-    return Lines(np.empty((5, 0)), np.empty((5, 0)), 0, 0)
+    return None
 
 
-def _translates(psf, o):
-    return o.translates
+_some_lines = by_type(lambda family: _lines_of if hasattr(family, "line") else _no_lines)
 
 
-def _never(psf, o):
-    return False
+@inner()
+def lines_of(translates, psf, layout, s, first, last):
+    """The lines of source s over the rows of the footprints from first to last - 1.
 
-
-# Whether images are products, and the lines of source s over the rows of the footprints from first
-# to last - 1.
-are_products = by_type(lambda family: _translates if hasattr(family, "line") else _never)
-lines_of = by_type(lambda family: _lines_of if hasattr(family, "line") else _no_lines)
+    They are None, a type of its own for which nothing else here is compiled, where images are no
+    products: without `translates`, or of a PSF that is none.
+    """
+    if translates is None:
+        return None
+    return _some_lines(psf, layout, s, first, last)

@@ -19,7 +19,6 @@ from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.products import (
     add_product,
     add_product_templates,
-    are_products,
     lines_of,
 )
 from bayesfred.imaging.kernels.psf_dispatch import (
@@ -44,9 +43,8 @@ def add_source(layout, s, rows, flux, canvas, alone):
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this
     # function: a call costs more than a short row.
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
-    if are_products(o.psf, o):
-        lines = lines_of(o.psf, layout, s, rows[0], rows[1])
-        add_product(lines, fp, rows, flux, canvas, alone)
+    lines = lines_of(o.translates, o.psf, layout, s, rows[0], rows[1])
+    if add_product(lines, fp, rows, flux, canvas, alone):
         return
     source = one_source(layout.geometry, s)
     d, u, v = source.d, source.u, source.v
@@ -90,9 +88,8 @@ def add_templates(layout, s, flux, stamps, wider):
     sigma.
     """
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
-    if are_products(o.psf, o):
-        lines = lines_of(o.psf, layout, s, fp.first[s], fp.first[s + 1])
-        add_product_templates(lines, fp, s, flux, stamps, wider)
+    lines = lines_of(o.translates, o.psf, layout, s, fp.first[s], fp.first[s + 1])
+    if add_product_templates(lines, fp, s, flux, stamps, wider):
         return
     source = one_source(layout.geometry, s)
     offsets, weights, step, ramp = o.offsets, o.weights, o.step, o.ramp

@@ -23,7 +23,7 @@ from bayesfred.imaging.kernels.jacobian import (
     widens,
 )
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-from bayesfred.imaging.kernels.products import are_products, lines_of, product_sums
+from bayesfred.imaging.kernels.products import lines_of, product_sums
 
 
 class Sums(NamedTuple):
@@ -170,9 +170,10 @@ def add_basis_sums(layout, basis, s, template, weight, buffers):
     sums, out, degrees = buffers.sums, buffers.out, layout.optics.degrees
     source, first = one_source(layout.geometry, s), layout.footprints.first
     a, b, n_f, n_g = source.a, source.b, basis.f.shape[0], basis.g.shape[0]
-    if are_products(layout.optics.psf, layout.optics):
-        lines = lines_of(layout.optics.psf, layout, s, first[s], first[s + 1])
-        flux, by_a, by_b, wide = product_sums(lines, layout.footprints, s, template, weight)
+    o, fp = layout.optics, layout.footprints
+    lines = lines_of(o.translates, o.psf, layout, s, first[s], first[s + 1])
+    is_product, flux, by_a, by_b, wide = product_sums(lines, fp, s, template, weight)
+    if is_product:
         for k in range(n_f):
             out[k] += by_a
         for k in range(n_f, n_f + n_g):

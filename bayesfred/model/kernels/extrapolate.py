@@ -184,7 +184,10 @@ def _sum_up(frame, w, parameters, visit, fluxes):
                 place[i] = used + fp.start[i] - fp.start[p]
             used += fp.start[q] - fp.start[p]
             add_source(layout, s, (p, q), fluxes[s], visit.canvas, visit.templates)
-        weigh_rows(frame, noise, w, parameters.background, (top, last), expanded)
+        if expanded:
+            weigh_rows(frame, noise, w, parameters.background, (top, last), w.ratio)
+        else:
+            weigh_rows(frame, noise, w, parameters.background, (top, last), None)
         _multiply_band(w, visit, top, last)
 
 

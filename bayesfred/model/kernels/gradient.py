@@ -72,8 +72,8 @@ from bayesfred.model.kernels.likelihood import (
     weigh_rows,
 )
 from bayesfred.model.kernels.noise_dispatch import (
+    by_exactness,
     error_slopes,
-    exact_weight,
     given,
     level_derivatives,
     unreached,
@@ -258,10 +258,27 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
 
 
 @inner()
-def _responses(frame, noise, w, background):
-    """-dr/dmu of the marked pixels where the weight is not that."""
-    if exact_weight(noise):
-        return np.empty(0)
+def _ratios(profiled, w):
+    """Where the ratios of the workspace are wanted; None where fluxes are fixed."""
+    if profiled is None:
+        return None
+    return w.ratio
+
+
+def _no_responses(noise, frame, w, background):
+    return np.empty(0)
+
+
+def _light_responses(noise, frame, w, background):
+    return _fill_responses(noise, frame, w, background)
+
+
+# -dr/dmu of the marked pixels where the weight is not that.
+_responses = by_exactness(_no_responses, _light_responses)
+
+
+@inner()
+def _fill_responses(noise, frame, w, background):
     out, pitch = np.zeros(w.image.size), w.image.size // frame.ny
     for j in range(frame.ny):
         c0, c1, c2 = background_row(background, j, frame.ny)
@@ -276,18 +293,27 @@ def _responses(frame, noise, w, background):
     return out
 
 
+def _exact_images(noise, frame, w, background, h, y):
+    if h.size == 0:  # fluxes are fixed
+        return w.score, w.score, 0.0
+    for k in range(w.flags.size):
+        if w.flags[k] != 0:
+            for p in range(k * SEGMENT, (k + 1) * SEGMENT):
+                h[p] = w.score[p] + w.weight[p] * (w.ratio[p] * h[p] - y[p])
+    return h, h, 0.0
+
+
+def _light_images(noise, frame, w, background, h, y):
+    return _fill_images(noise, frame, w, background, h, y)
+
+
+# A of the light and of the background, and the sum that is the slope by the model error.
+_images = by_exactness(_exact_images, _light_images)
+
+
 @inner()
-def _images(frame, noise, w, background, h, y):
-    """A of the light and of the background, and the sum that is the slope by the model error."""
+def _fill_images(noise, frame, w, background, h, y):
     profiled = h.size > 0
-    if exact_weight(noise):
-        if not profiled:
-            return w.score, w.score, 0.0
-        for k in range(w.flags.size):
-            if w.flags[k] != 0:
-                for p in range(k * SEGMENT, (k + 1) * SEGMENT):
-                    h[p] = w.score[p] + w.weight[p] * (w.ratio[p] * h[p] - y[p])
-        return h, h, 0.0
     light, level, slope = w.score.copy(), np.zeros(w.image.size), 0.0
     pitch = w.image.size // frame.ny
     for j in range(frame.ny):
@@ -360,13 +386,14 @@ def gradient(problem, w, rendered, parameters, basis, out):
         return (math.nan, math.nan), np.empty((0, 0))
     fp, pitch = rendered.footprints, w.image.size // o.ny
     layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
-    weigh_rows(frame, noise, w, background, (0, o.ny), rendered.profiled is not None)
+    ratios = _ratios(rendered.profiled, w)
+    weigh_rows(frame, noise, w, background, (0, o.ny), ratios)
     scatter = parameters.nuisances.position_scatter
-    response = _responses(frame, noise, w, background)
+    response = _responses(noise, frame, w, background)
     z, mixed, h, y, slope = _laplace_adjoint(
         w, layout, rendered, rendered.profiled, scatter, response
     )
-    image, below, by_error = _images(frame, noise, w, background, h, y)
+    image, below, by_error = _images(noise, frame, w, background, h, y)
     _add_background(frame, w, below, out[1])
     out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]
     out[1][0] += level_derivatives(frame.noise, frame.pixels, level, value)[0]

@@ -6,13 +6,13 @@ zero between calls; the reader clears it.
 """
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner, shared
-from bayesfred.imaging.kernels.contexts import SEGMENT
+from bayesfred.imaging.kernels.contexts import SEGMENT, Optics, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
 from bayesfred.model.kernels.contexts import LIMIT, Unreached, Workspace
@@ -36,25 +36,28 @@ class Stretch(NamedTuple):
     step: float
 
 
-@entry()
-def new_workspace(o, nuisances, free):
+def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | None) -> Workspace:
     """Buffers for one thread.
 
     With free fluxes they hold the templates as they are without a distortion and a quarter more.
     """
     ny, pitch = o.ny, o.ramp.size
-    span = np.empty((ny, 2), np.int64)
-    span[:, 0] = pitch
-    span[:, 1] = -1
+    span = np.tile(np.array([pitch, -1]), (ny, 1))
     size, more = ny * pitch, 0
     if free is not None:
-        geometry = new_geometry(o)
-        locate(o, np.zeros(o.f_powers.shape[0] + o.g_powers.shape[0]), nuisances, geometry)
-        samples = find_footprints(o, geometry).start[-1]
+        samples = count_samples(o, nuisances)
         more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
     flags = np.zeros(size // SEGMENT, np.uint8)
     score, weight, ratio = np.empty(size), np.empty(size), np.empty(size)
     return Workspace(np.zeros(size), flags, span, score, weight, ratio, np.empty(more))
+
+
+@entry()
+def count_samples(o, nuisances):
+    """How many pixels all sources reach without a distortion, each source's counted by itself."""
+    geometry = new_geometry(o)
+    locate(o, np.zeros(o.f_powers.shape[0] + o.g_powers.shape[0]), nuisances, geometry)
+    return find_footprints(o, geometry).start[-1]
 
 
 @inner()
@@ -171,8 +174,12 @@ def weigh_run(noise, part, score, weight, ratio):
             ratio[i] = c / w if counted and w > LEAST else 0.0
 
 
-@inner()
-def _weigh_rows(frame, noise, w, background, rows, ratios):
+@shared()
+def weigh_rows(frame, noise, w, background, rows, ratios):
+    """Score and weight of the marked pixels of rows (first, last + 1).
+
+    And their ratios, unless `ratios` is None.
+    """
     pitch = frame.values.size // frame.ny
     for j in range(rows[0], rows[1]):
         start, stop = next_run(w, j, w.span[j, 0])
@@ -182,18 +189,6 @@ def _weigh_rows(frame, noise, w, background, rows, ratios):
             ratio = None if ratios is None else ratios[a:b]
             weigh_run(noise, part, w.score[a:b], w.weight[a:b], ratio)
             start, stop = next_run(w, j, stop)
-
-
-@shared()
-def weigh_rows(frame, noise, w, background, rows, ratios):
-    """Score and weight of the marked pixels of rows (first, last + 1), and their ratios if wanted.
-
-    Where they are not, the ratios are left as they are.
-    """
-    if ratios:
-        _weigh_rows(frame, noise, w, background, rows, w.ratio)
-    else:
-        _weigh_rows(frame, noise, w, background, rows, None)
 
 
 @shared(fastmath=FAST)

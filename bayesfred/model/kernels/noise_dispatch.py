@@ -101,6 +101,13 @@ def _no_information(noise, mu, light, p):
 summed = _optional("summed", _pixel_by_pixel)
 spread = by_type(lambda family: family.spread)
 given = _optional("given", _same)
+
+
+def by_exactness(exact: Callable[..., Any], inexact: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of a noise model with another code for families that have `exact_weight`."""
+    return by_type(lambda family: inexact if hasattr(family, "exact_weight") else exact)
+
+
 # What a model error adds, see `model_error.py`.
 exact_weight = _optional("exact_weight", _exact)
 error_slopes = _optional("error_slopes", _no_slopes)
