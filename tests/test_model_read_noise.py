@@ -204,6 +204,35 @@ def test_bright_dark_and_masked_pixels_are_summed_alike(r: float) -> None:
     assert ours == pytest.approx(theirs, rel=1e-8 if r < 1.0 else 1e-6)
 
 
+WIDE = (12, 1100)  # more columns than are summed at a time
+EXTREMES: dict[str, Any] = {
+    "one": 0.6,
+    "map": RNG.uniform(1.0, 3.0, WIDE),
+    "a very noisy pixel": np.where(np.arange(1100) == 600, 1e6, 2.0) * np.ones(WIDE),
+    "an almost noiseless pixel": np.where(np.arange(1100) == 600, 0.01, 2.0) * np.ones(WIDE),
+}
+
+
+@pytest.mark.parametrize("case", EXTREMES)
+def test_wide_frames_and_extreme_pixels_are_summed_pixel_by_pixel(case: str) -> None:
+    sources = SourceCatalog(np.arange(-500.0, 501.0, 50.0), np.zeros(21), np.full(21, 3e3))
+    distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
+    model = ForwardModel(Detector(WIDE), sources, GaussianPSF(9.0), distortion)
+    noise, rng = PoissonNoise(EXTREMES[case]), np.random.default_rng(711)
+    for background in (0.05, 5.0):
+        image = model.expected_counts([0.0, 0.0], background)
+        counts = noise.draw(image, 0.0, rng)
+        counts[3, 500:520], counts[4, 511:514] = -40.0, 2e4
+        mask = rng.random(WIDE) < 0.95
+        posterior = Posterior(model, counts, noise=noise, mask=mask)
+        params = np.array([0.0, 0.0, background])
+        value = posterior.log_prob(params) - posterior.log_prior(params)[0]
+        terms = noise.log_likelihood(counts, image, 0.0)[mask]
+        assert value == pytest.approx(math.fsum(terms), rel=1e-9)
+        assert posterior.log_prob(params * [1.0, 1.0, -1.0]) == -math.inf
+        assert np.isfinite(noise.log_likelihood(counts, np.full(WIDE, 1e-12), 0.0)).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(k, marks=[pytest.mark.long] * (k == "map")) for k in FRAMES]

@@ -13,6 +13,7 @@ Bytes = npt.NDArray[np.uint8]
 
 MASKED = -1e300  # stands for the counts of a pixel outside the likelihood
 LIMIT = -1e299
+STRETCH = 512  # pixels that are summed at a time where it takes several passes
 
 
 class Frame(NamedTuple):
@@ -56,6 +57,7 @@ class Workspace(NamedTuple):
     ratio: Floats
     # what profiling fills again on every call, kept because new memory costs more than its use
     heap: Floats
+    scratch: Floats  # (4, STRETCH)
 
 
 class Vectors(NamedTuple):

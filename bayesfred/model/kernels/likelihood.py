@@ -15,7 +15,7 @@ from bayesfred.imaging.kernels.compilation import entry, inner, shared
 from bayesfred.imaging.kernels.contexts import SEGMENT, Optics, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
-from bayesfred.model.kernels.contexts import LIMIT, Unreached, Workspace
+from bayesfred.model.kernels.contexts import LIMIT, STRETCH, Unreached, Workspace
 from bayesfred.model.kernels.noise_dispatch import derivatives, given, summed, unreached
 
 LEAST = 1e-200  # weight of a pixel that tells anything
@@ -49,7 +49,8 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
         more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
     flags = np.zeros(size // SEGMENT, np.uint8)
     score, weight, ratio = np.empty(size), np.empty(size), np.empty(size)
-    return Workspace(np.zeros(size), flags, span, score, weight, ratio, np.empty(more))
+    heap, scratch = np.empty(more), np.empty((4, STRETCH))
+    return Workspace(np.zeros(size), flags, span, score, weight, ratio, heap, scratch)
 
 
 @entry()
@@ -232,7 +233,7 @@ def log_likelihood(frame, w, parameters):
                 part = stretch(frame, background, j, a, light)
                 level, image = part.c0, w.score[a:b]
                 slope_run(part, image)
-            total += summed(noise, frame.values[a:b], light, image, level, a)
+            total += summed(noise, frame.values[a:b], light, image, level, (a, w.scratch))
             start, stop = next_run(w, j, stop)
     rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
     return -math.inf if total + rest < LIMIT else total + rest

@@ -16,8 +16,9 @@ These see a pixel outside the likelihood, too, as one with n = mu; what they ret
 used. They must not branch where a loop shall vectorise. A model may have its own way to sum over
 whole segments of a row, the mean being image + level:
 
-    summed(noise, values, light, image, level, first)
-                                      the sum of log_density; the first pixel's place is `first`
+    summed(noise, values, light, image, level, place)
+                                      the sum of log_density; `place` is the first pixel's, and the
+                                      `scratch` of the `Workspace`
 
 Where the background is constant, it may spare the loops the pixels that no source reaches:
 
@@ -42,9 +43,9 @@ from typing import Any
 import numpy as np
 
 from bayesfred.imaging.kernels.compilation import inner
-from bayesfred.imaging.kernels.fastmath import REDUCE
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.psf_dispatch import by_type
-from bayesfred.model.kernels.contexts import LIMIT
+from bayesfred.model.kernels.contexts import LIMIT, STRETCH
 
 
 def _optional(name: str, default: Callable[..., Any]) -> Callable[..., Any]:
@@ -82,8 +83,8 @@ def sum_pixels(noise, values, light, image, level, first):
     return total
 
 
-def _pixel_by_pixel(noise, values, light, image, level, first):
-    return sum_pixels(noise, values, light, image, level, first)
+def _pixel_by_pixel(noise, values, light, image, level, place):
+    return sum_pixels(noise, values, light, image, level, place[0])
 
 
 def _exact(noise):
@@ -113,3 +114,25 @@ exact_weight = _optional("exact_weight", _exact)
 error_slopes = _optional("error_slopes", _no_slopes)
 error_information = _optional("error_information", _no_information)
 level_derivatives = _optional("level_derivatives", _no_derivatives)
+
+
+@inner(fastmath=FAST)
+def _fill_means(image, level, response, out):
+    for i in range(out.size):
+        out[i] = (image[i] + level) * response[i]
+
+
+@inner()
+def sum_scaled(noise, counts, mean, place):
+    """The sum of log_density over segments whose means (image, level, response) are scaled.
+
+    Counts and response are those of the whole frame.
+    """
+    (image, level, response), (first, scratch), total = mean, place, 0.0
+    for a in range(0, image.size, STRETCH):
+        part = image[a : a + STRETCH]
+        begin, mu = first + a, scratch[3, : part.size]
+        end = begin + part.size
+        _fill_means(part, level, response[begin:end], mu)
+        total += summed(noise, counts[begin:end], mu, mu, 0.0, (begin, scratch))
+    return total

@@ -27,14 +27,8 @@ without approximation, where phi(y) is the density of Poisson(y) + N(0, r^2) at 
 
 and `CORRECTION` is a polynomial that goes on to q^4. It was fitted to the sum, from which it
 differs by less than 1e-5 for any y. The mean is y = r^2 omega(log(mu / r^2) + n / r^2), where omega
-+ log omega = x. A table of omega gives s to 2e-3, and a step of Newton's method with its
++ log omega = x. A rough omega gives s to 2e-3, and a step of Newton's method with its
 second-order term makes that 1e-8.
-
-One read noise: g is a function of one variable, so that a table of it gives log p for a logarithm
-and a polynomial, whatever the read noise. As a polynomial of degree 4 on cells of width 1/8 it is
-right to 5e-10 of its fifth derivative, the fifth cumulant of k, which is below 0.2 if r < 1 and
-below r^2 otherwise. Rounding counts where g is large, so the table ends at `WIDEST`; the formulas
-above are used for brighter pixels.
 
 References
 ----------
@@ -45,27 +39,21 @@ R. M. Corless, D. J. Jeffrey (2002), LNCS 2385, 76: the Wright omega function.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba.extending import overload
-from scipy.special import gammaln, wrightomega
+from scipy.special import gammaln
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import inner
 from bayesfred.imaging.kernels.fastmath import FAST, LOG2_E, as_bits, as_float, exp2, log
-from bayesfred.model.kernels.contexts import LIMIT, MASKED
 
 REACH = 8  # terms of the sum on either side of n
 WIDE = 1.0  # variance of the read noise from which on the saddlepoint expansion serves
-NEAREST = 6755399441055744.0  # added to a number, it leaves the nearest integer in the lowest bits
-NEAREST_BITS = int(np.float64(NEAREST).view(np.int64))
 LEAST = 1e-30  # stands for smaller expected counts in the sum, whose powers must not underflow
 NEGLIGIBLE = 1e-25  # of successive terms, whose products shall not become denormal numbers
 TINY = 1e-200  # ... and in the saddlepoint expansion
-CELL = 0.125  # width of the cells of the table of g
-WIDEST = 4096.0  # the largest n / r^2 that it serves
-MARGIN = 28.0  # of its range: g(1 / 2 r^2 - 28) is below 1e-12, and exp(28) no expected count
 
 # log phi + 1/2 log(2 pi v): coefficients of q^i rho^j, a row for i = 1, 2, 3, 4, from j = 1 on
 CORRECTION = (
@@ -90,31 +78,6 @@ def _correction_table() -> Floats:
 
 
 CORRECTIONS = _correction_table()
-
-# omega(x) at the middle of cells that are equal in the bits of x + OFFSET, and its slope
-OFFSET = 41.0
-CELL_BITS = 7  # of the mantissa
-CELL_SHIFT = 52 - CELL_BITS
-FIRST_CELL = 1023 << CELL_BITS
-
-
-def _omega_table() -> Floats:
-    cells = np.arange(52 << CELL_BITS, dtype=np.int64) + FIRST_CELL  # x up to 2^52
-    middle = ((cells << CELL_SHIFT) | (1 << (CELL_SHIFT - 1))).view(np.float64)
-    omega = np.real(wrightomega(middle - OFFSET))
-    return np.stack([omega, 1.0 / (1.0 + omega)], axis=1).ravel()
-
-
-OMEGA = _omega_table()
-
-
-class CumulantTable(NamedTuple):
-    """The function g of one read noise, in cells whose middles are `first` + `CELL` i."""
-
-    first: float
-    last: float  # number of the last cell
-    cells: Floats  # (5 cells,) polynomials in the distance from the middle in cells, 1 first
-    left_out: Floats  # (segments,) what a segment's sum leaves out; MASKED if it is too bright
 
 
 @inner(fastmath=FAST, forceinline=True)
@@ -232,32 +195,81 @@ def _rough_log(x):
     return k * math.log(2.0) + p
 
 
+@inner(fastmath=FAST, forceinline=True)
+def rough_x(n, mu, inverse):
+    """log(mu / r^2) + n / r^2, where `inverse` is 1 / r^2."""
+    return n * inverse + _rough_log(mu * inverse)
+
+
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+def rough_omega(x):
+    """omega(x) to 2e-3, and 1 / (1 + omega) to 1 %.
+
+    A step of Newton's method from a square and a line: where omega is above 0.05 it begins within
+    7 %, whose square counts.
+    """
+    u = min(max(x, -6.0), 3.0)
+    root = 0.75107911 + u * (0.21642757 + u * 0.01549135)
+    w = max(root * root, 0.93841083 * x - 0.89488641)
+    known = 1.0 / (1.0 + w)
+    omega = max(w * (1.0 + x - _rough_log(w)) * known, 0.0)
+    return omega, known * (2.0 - (1.0 + omega) * known)
+
+
+@inner(fastmath=FAST, forceinline=True)
+def tilted_mean(mu, s):
+    """y of a tilt s."""
+    return mu * _exp(s)
+
+
+@inner(fastmath=FAST, forceinline=True)
+def improved(n, mu, variance, s, y, q):
+    """log p without log phi from rough s, y and q, and s, y and q to 1e-8.
+
+    log p is stationary in s, so that the change of s counts by its square.
+    """
+    total, tilt = y + variance, variance * s
+    q = q * (2.0 - total * q)
+    less = y + tilt - n
+    change = less * q
+    term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + change * (y * q) * (1.0 / 6.0))
+    change *= 1.0 + 0.5 * change * (y * q)
+    less = y * change * (1.0 - change * (0.5 - change * (1.0 / 6.0)))
+    wrong = 1.0 - (total - less) * q
+    return term, s - change, y - less, q + q * (wrong + wrong * wrong)
+
+
+@inner(fastmath=FAST, forceinline=True)
+def correction(q, rho):
+    """log phi + 1/2 log(2 pi v)."""
+    one, two, three, four = CORRECTION
+    total = four[5]
+    for j in range(4, -1, -1):
+        total = total * rho + four[j]
+    by = three[5]
+    for j in range(4, -1, -1):
+        by = by * rho + three[j]
+    total = total * q + by
+    by = two[3]
+    for j in range(2, -1, -1):
+        by = by * rho + two[j]
+    return rho * q * (one[0] + rho * one[1] + q * (by + q * total))
+
+
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilt(n, mu, variance):
-    """s and y to 1e-8, and 1 / (y + r^2)."""
+    """log p without log phi, and s, y and 1 / (y + r^2) to 1e-8."""
     inverse = 1.0 / variance
-    shifted = max(n * inverse + _rough_log(mu * inverse) + OFFSET, 1.0)
-    bits = as_bits(shifted)
-    cell = np.uint64((bits >> CELL_SHIFT) - FIRST_CELL) * np.uint64(2)
-    middle = as_float(((bits >> CELL_SHIFT) << CELL_SHIFT) | (1 << (CELL_SHIFT - 1)))
-    omega, slope = OMEGA[cell], OMEGA[cell + np.uint64(1)]
-    s = n * inverse - omega * (1.0 + (shifted - middle) * slope)
-    y = mu * _exp(s)
-    q = 1.0 / (y + variance)
-    newton = (y + variance * s - n) * q
-    change = newton * (1.0 + 0.5 * newton * y * q)
-    less = y * change * (1.0 - change * (0.5 - change * (1.0 / 6.0)))
-    relative = less * q  # of y + r^2
-    return s - change, y - less, q * (1.0 + relative * (1.0 + relative * (1.0 + relative)))
+    omega, known = rough_omega(rough_x(n, mu, inverse))
+    s = n * inverse - omega
+    return improved(n, mu, variance, s, tilted_mean(mu, s), known * inverse)
 
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilted_density(n, mu, variance):
     """log p of the saddlepoint expansion, less -1/2 log(2 pi)."""
-    mu = max(mu, TINY)
-    s, y, q = _tilt(n, mu, variance)
-    tilted = y - mu + s * (0.5 * variance * s - n)
-    return tilted + 0.5 * log(q) + _correct(0, q, variance * q)
+    term, _, _, q = _tilt(n, max(mu, TINY), variance)
+    return term + 0.5 * log(q) + correction(q, 1.0 - variance * q)
 
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
@@ -268,7 +280,7 @@ def _tilted_derivatives(n, mu, variance):
     and M = q d/dq, L y = y tau and L = -rho tau M for functions of q.
     """
     mu = max(mu, TINY)
-    s, y, q = _tilt(n, mu, variance)
+    _, s, y, q = _tilt(n, mu, variance)
     y = mu * _exp(s - (y + variance * s - n) * q)  # to rounding
     q = 1.0 / (y + variance)
     tau, rho = variance * q, y * q
@@ -279,22 +291,6 @@ def _tilted_derivatives(n, mu, variance):
     second = y * tau + by1 * m1 + by * by * m2
     third = y * tau * tau * tau + by2 * m1 + 3.0 * by * by1 * m2 + by * by * by * m3
     return _derivatives(mu, y + by * m1, second, third)
-
-
-@inner(fastmath=FAST, forceinline=True)
-def tabulated_density(table, n, mu, inverse):
-    """log p without what depends on n alone, from the table of g; `inverse` is 1 / r^2."""
-    x = (log(max(mu, TINY)) + n * inverse - table.first) * (1.0 / CELL)
-    x = min(max(x, 0.0), table.last)
-    shifted = x + NEAREST  # rounded, see `fastmath.exp2`
-    w = x - (shifted - NEAREST)
-    at = np.uint64(as_bits(shifted) - NEAREST_BITS) * np.uint64(5)
-    c = table.cells
-    g = c[at + np.uint64(4)]
-    g = g * w + c[at + np.uint64(3)]
-    g = g * w + c[at + np.uint64(2)]
-    g = g * w + c[at + np.uint64(1)]
-    return (g * w + c[at]) - mu
 
 
 def _choice(few: Any, many: Any, mixed: Any) -> Any:
@@ -353,34 +349,3 @@ def left_out(counts: Floats, variance: float | Floats) -> Floats:
     k = np.maximum(np.rint(counts), 0.0)
     few = gammaln(k + REACH + 1.0) + 0.5 * ((counts - k) ** 2 / variance + np.log(variance))
     return -0.5 * math.log(2.0 * math.pi) - np.where(np.asarray(variance) < WIDE, few, 0.0)
-
-
-@entry(fastmath=FAST, error_model="numpy")
-def _densities(kind, n, mu, variance, out):
-    for i in range(out.size):
-        out[i] = density_of(kind, n[i], mu[i], variance)
-
-
-def cumulant_table(variance: float, values: Floats, segment: int) -> CumulantTable:
-    """The table of g for a frame of padded rows, whose segments have `segment` pixels."""
-    used = values > LIMIT
-    served = np.where(used & (values <= WIDEST * variance), values, 0.0)
-    first = 0.5 / variance - MARGIN
-    cells = math.ceil((float(served.max()) / variance + MARGIN - first) / CELL) + 1
-    nodes = 0.5 * np.cos(np.pi * (np.arange(5) + 0.5) / 5.0)
-    x = first + CELL * (np.arange(cells)[:, None] + nodes)
-    # g does not depend on n and mu apart: at the mean itself the density is right to rounding
-    mean = np.real(wrightomega(x - math.log(variance))).ravel() * variance
-    g = np.empty(mean.size)
-    _densities(kind_of(variance), mean, mean, variance, g)
-    g += mean + left_out(mean, variance) - _left_out_of_table(mean, variance)
-    polynomials = np.linalg.solve(np.vander(nodes, 5, increasing=True), g.reshape(x.shape).T).T
-    part = _left_out_of_table(served, variance) - left_out(served, variance)
-    left = np.where(used, part, 0.0).reshape(-1, segment).sum(axis=1)
-    left[(used & (values > WIDEST * variance)).reshape(-1, segment).any(axis=1)] = MASKED
-    return CumulantTable(first, cells - 1.0, np.ascontiguousarray(polynomials).ravel(), left)
-
-
-def _left_out_of_table(counts: Floats, variance: float) -> Floats:
-    """What `tabulated_density` leaves out of log p."""
-    return -0.5 * (counts * counts / variance + math.log(2.0 * math.pi * variance))

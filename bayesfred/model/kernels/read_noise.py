@@ -20,14 +20,14 @@ from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
-from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density, sum_pixels
+from bayesfred.model.kernels.cumulants import CumulantTable
+from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
 from bayesfred.model.kernels.poisson_gaussian import (
-    CumulantTable,
     density_of,
     derivatives_of,
     kind_of,
-    tabulated_density,
 )
+from bayesfred.model.kernels.read_noise_sums import sum_up
 
 VALUE_TERMS = 12
 INFORMATION_TERMS = 6
@@ -70,9 +70,9 @@ class ReadNoiseTerms(NamedTuple):
         return density_of(noise.kind, n, mu, _at(noise.variance, p)) if mu >= 0.0 else MASKED
 
     @staticmethod
-    def summed(noise: Any, values: Any, light: Any, image: Any, level: Any, first: Any) -> Any:
+    def summed(noise: Any, values: Any, light: Any, image: Any, level: Any, place: Any) -> Any:
         """Sum of log_density over segments."""
-        return _sum_up(noise.cumulants, noise, values, image, level, first)
+        return sum_up(noise, values, image, level, place)
 
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
@@ -92,7 +92,7 @@ class ReadNoiseTerms(NamedTuple):
     @staticmethod
     def unreached(noise: Any, rest: Any, level: Any) -> Any:
         """Sums over the pixels that no source reaches."""
-        return _unreached(noise, rest, level)
+        return sum_unreached(noise, rest, level)
 
 
 def _at(values: Any, p: Any) -> Any:
@@ -104,50 +104,6 @@ def _choose_at(values: Any, p: Any) -> Any:
     if isinstance(values, types.Array):
         return lambda values, p: values[p]
     return lambda values, p: values
-
-
-@inner(fastmath=REDUCE, error_model="numpy")
-def _sum_tabulated(noise, values, image, level):
-    table, inverse, total = noise.cumulants, 1.0 / noise.variance, 0.0
-    for i in range(image.size):
-        mu = image[i] + level
-        counted = values[i] > LIMIT
-        term = tabulated_density(table, values[i] if counted else mu, mu, inverse)
-        term = term if mu >= 0.0 else MASKED
-        total += term if counted else 0.0
-    return total
-
-
-@inner()
-def _sum_segments(noise, values, image, level, first):
-    left_out, total, k = noise.cumulants.left_out, 0.0, 0
-    last = image.size // SEGMENT
-    while k < last:
-        begin, served = k, left_out[first // SEGMENT + k] > LIMIT
-        while k < last and (left_out[first // SEGMENT + k] > LIMIT) == served:
-            total += left_out[first // SEGMENT + k] if served else 0.0
-            k += 1
-        a, b = begin * SEGMENT, k * SEGMENT
-        if served:
-            total += _sum_tabulated(noise, values[a:b], image[a:b], level)
-        else:
-            total += sum_pixels(noise, values[a:b], image[a:b], image[a:b], level, first + a)
-    return total
-
-
-def _sum_up(table: Any, noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
-    raise NotImplementedError("for compiled code")
-
-
-@overload(_sum_up, inline="always", strict=False)
-def _choose_sum(table: Any, noise: Any, values: Any, image: Any, level: Any, first: Any) -> Any:
-    if isinstance(table, types.NoneType):
-        return lambda table, noise, values, image, level, first: sum_pixels(
-            noise, values, image, image, level, first
-        )
-    return lambda table, noise, values, image, level, first: _sum_segments(
-        noise, values, image, level, first
-    )
 
 
 @inner()
@@ -173,7 +129,7 @@ def _information(noise, mu, variance, row):
 
 
 @inner()
-def _unreached(noise, rest, level):
+def sum_unreached(noise, rest, level):
     """The pixels that no source reaches, from the Chebyshev series where these hold."""
     if rest.pixels <= 0.0:
         return 0.0, 0.0, 0.0
@@ -318,9 +274,9 @@ def _typical_level(counts: Floats, variance: float) -> float:
     return max(level, 1e-3)
 
 
-def level_series(noise: ReadNoiseTerms, values: Floats) -> LevelSeries:
-    """The series of a frame of padded rows."""
-    middle = math.log(_typical_level(values[values > LIMIT], float(np.median(noise.variance))))
+def level_series(noise: Any, values: Floats, variance: float) -> LevelSeries:
+    """The series of a frame of padded rows, whose read noise has about this variance."""
+    middle = math.log(_typical_level(values[values > LIMIT], variance))
     flat, parts = values.ravel(), []
     for terms, informed in ((VALUE_TERMS, False), (INFORMATION_TERMS, True)):
         angle = np.pi * (np.arange(terms) + 0.5) / terms
@@ -334,10 +290,14 @@ def level_series(noise: ReadNoiseTerms, values: Floats) -> LevelSeries:
     return LevelSeries(middle, series, series.sum(axis=0), flat)
 
 
+def no_series() -> LevelSeries:
+    """The series of no pixels."""
+    none = np.empty((0, 0))
+    return LevelSeries(0.0, none, none.ravel(), none.ravel())
+
+
 def new_terms(
     variance: float | Floats, rows: InformationRows, row: float | Floats
 ) -> ReadNoiseTerms:
     """The compiled half for pixels in the order in which they are given, without a frame."""
-    none = np.empty((0, 0))
-    level = LevelSeries(0.0, none, none.ravel(), none.ravel())
-    return ReadNoiseTerms(kind_of(variance), variance, row, *rows, level, None)
+    return ReadNoiseTerms(kind_of(variance), variance, row, *rows, no_series(), None)

@@ -21,7 +21,8 @@ from scipy.interpolate import CubicSpline
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.contexts import SEGMENT
-from bayesfred.model.kernels.poisson_gaussian import cumulant_table, left_out
+from bayesfred.model.kernels.cumulants import cumulant_table
+from bayesfred.model.kernels.poisson_gaussian import left_out
 from bayesfred.model.kernels.read_noise import (
     CELLS,
     InformationRows,
@@ -173,7 +174,8 @@ def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     cumulants = None
     if isinstance(read_noise, float):
         cumulants = cumulant_table(read_noise**2, values, SEGMENT)
-    return terms._replace(level=level_series(terms, values), cumulants=cumulants)
+    level = level_series(terms, values, float(np.median(np.square(read_noise))))
+    return terms._replace(level=level, cumulants=cumulants)
 
 
 def _terms(read_noise: float | Floats) -> ReadNoiseTerms:

@@ -1,0 +1,195 @@
+"""Sums of log p over stretches of pixels, for photons with read noise.
+
+The formulas are those of `poisson_gaussian`. They take long chains of operations, each of which
+waits for the one before, and a processor works on a pixel's and its neighbours' chains at a time
+only if these are short. So a stretch is summed in several passes, whose results stay in the fastest
+cache in between. A table is read one number at a time, because instructions that gather several are
+slower. The logarithm of four pixels' factors is that of their product.
+"""
+
+from typing import Any
+
+from numba import types
+from numba.extending import overload
+
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.contexts import SEGMENT
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log
+from bayesfred.model.kernels.contexts import LIMIT, MASKED, STRETCH
+from bayesfred.model.kernels.cumulants import table_cell, table_value
+from bayesfred.model.kernels.noise_dispatch import sum_pixels
+from bayesfred.model.kernels.poisson_gaussian import (
+    TINY,
+    correction,
+    improved,
+    rough_omega,
+    rough_x,
+    tilted_mean,
+)
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def _find_cells(noise, values, image, level, cells, places):
+    """The cells of a stretch's pixels in the table of g, and the sum of -mu."""
+    table, inverse, total = noise.cumulants, 1.0 / noise.variance, 0.0
+    for i in range(image.size):
+        mu, counted = image[i] + level, values[i] > LIMIT
+        x = log(max(mu, TINY)) + values[i] * inverse
+        cell, places[i] = table_cell(table, x, counted)
+        cells[i] = as_float(cell)
+        less = -mu if mu >= 0.0 else MASKED
+        total += less if counted else 0.0
+    return total
+
+
+@inner(fastmath=FAST)
+def _sum_cells(table, cells, places):
+    """Sum of g; without leave to reassociate, so that it is not made to gather."""
+    total = 0.0
+    for i in range(cells.size):
+        total += table_value(table, as_bits(cells[i]), places[i])
+    return total
+
+
+@inner()
+def _sum_tabulated(noise, values, image, level, scratch):
+    cells, places, total = scratch[0], scratch[1], 0.0
+    for a in range(0, image.size, STRETCH):
+        n, light = values[a : a + STRETCH], image[a : a + STRETCH]
+        cell, place = cells[: n.size], places[: n.size]
+        total += _find_cells(noise, n, light, level, cell, place)
+        total += _sum_cells(noise.cumulants, cell, place)
+    return total
+
+
+@inner(fastmath=REDUCE)
+def _sum(x):
+    total = 0.0
+    for i in range(x.size):
+        total += x[i]
+    return total
+
+
+def _fields(noise: Any) -> dict[str, Any]:
+    return dict(zip(noise.fields, noise.types, strict=True))
+
+
+def _sum_formulas(noise: Any, values: Any, image: Any, level: Any, place: Any) -> Any:
+    raise NotImplementedError("for compiled code")
+
+
+@overload(_sum_formulas, inline="always", strict=False)
+def _choose_formulas(noise: Any, values: Any, image: Any, level: Any, place: Any) -> Any:
+    if len(_fields(noise)["kind"]) == 1 and isinstance(_fields(noise)["variance"], types.Array):
+        return lambda noise, values, image, level, place: _sum_expansion(
+            noise.variance[place[0] : place[0] + image.size], values, image, level, place[1]
+        )
+    return lambda noise, values, image, level, place: sum_pixels(
+        noise, values, image, image, level, place[0]
+    )
+
+
+@inner()
+def _sum_segments(noise, values, image, level, place):
+    """The sum from the table, or from the formulas where it does not serve."""
+    (first, scratch), total, k = place, 0.0, 0
+    last = image.size // SEGMENT
+    left_out = noise.cumulants.left_out[first // SEGMENT :][:last]
+    whole = _sum(left_out)
+    if whole > LIMIT:  # the table serves all of them
+        return whole + _sum_tabulated(noise, values, image, level, scratch)
+    while k < last:
+        begin, served = k, left_out[k] > LIMIT
+        while k < last and (left_out[k] > LIMIT) == served:
+            total += left_out[k] if served else 0.0
+            k += 1
+        a, b = begin * SEGMENT, k * SEGMENT
+        if served:
+            total += _sum_tabulated(noise, values[a:b], image[a:b], level, scratch)
+        else:
+            total += _sum_formulas(noise, values[a:b], image[a:b], level, (first + a, scratch))
+    return total
+
+
+@inner(fastmath=FAST, error_model="numpy")
+def _find_x(variance, values, image, level, x, q):
+    for i in range(image.size):
+        q[i] = 1.0 / variance[i]
+        x[i] = rough_x(values[i], max(image[i] + level, TINY), q[i])
+
+
+@inner(fastmath=FAST, error_model="numpy")
+def _find_tilt(values, x, q):
+    """The tilts s in place of x, and 1 / (y + r^2) roughly in place of 1 / r^2."""
+    for i in range(x.size):
+        omega, known = rough_omega(x[i])
+        x[i] = values[i] * q[i] - omega
+        q[i] *= known
+
+
+@inner(fastmath=FAST, error_model="numpy")
+def _find_means(image, level, s, y):
+    for i in range(s.size):
+        y[i] = tilted_mean(max(image[i] + level, TINY), s[i])
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def _sum_tilted(variance, values, image, level, rough):
+    """The sum of log p without log phi, and 1 / (y + r^2) in place of its rough value."""
+    (s, y, q), total = rough, 0.0
+    for i in range(image.size):
+        n, mu = values[i], image[i] + level
+        term, _, _, known = improved(n, mu, variance[i], s[i], y[i], q[i])
+        q[i] = known if n > LIMIT else 1.0
+        term = term if mu >= 0.0 else MASKED
+        total += term if n > LIMIT else 0.0
+    return total
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def _sum_corrections(variance, values, q):
+    total = 0.0
+    for i in range(q.size):
+        term = correction(q[i], 1.0 - variance[i] * q[i])
+        total += term if values[i] > LIMIT else 0.0
+    return total
+
+
+@inner(fastmath=REDUCE, error_model="numpy")
+def _sum_logs(q):
+    quarter, total = q.size // 4, 0.0
+    for i in range(quarter):
+        a, b = q[i] * q[i + quarter], q[i + 2 * quarter] * q[i + 3 * quarter]
+        total += log(a * b)
+    return total
+
+
+@inner()
+def _sum_expansion(variance, values, image, level, scratch):
+    """The sum of the saddlepoint expansion over pixels that differ in their read noise."""
+    total = 0.0
+    for a in range(0, image.size, STRETCH):
+        n, light, r = values[a : a + STRETCH], image[a : a + STRETCH], variance[a : a + STRETCH]
+        s, y, q = scratch[0, : n.size], scratch[1, : n.size], scratch[2, : n.size]
+        _find_x(r, n, light, level, s, q)
+        _find_tilt(n, s, q)
+        _find_means(light, level, s, y)
+        total += _sum_tilted(r, n, light, level, (s, y, q))
+        total += _sum_corrections(r, n, q) + 0.5 * _sum_logs(q)
+    return total
+
+
+def sum_up(noise: Any, values: Any, image: Any, level: Any, place: Any) -> Any:
+    """Sum of log p over segments, from the table of one read noise where there is one."""
+    raise NotImplementedError("for compiled code")
+
+
+@overload(sum_up, inline="always", strict=False)
+def _choose_sum(noise: Any, values: Any, image: Any, level: Any, place: Any) -> Any:
+    if isinstance(_fields(noise)["cumulants"], types.NoneType):
+        return lambda noise, values, image, level, place: _sum_formulas(
+            noise, values, image, level, place
+        )
+    return lambda noise, values, image, level, place: _sum_segments(
+        noise, values, image, level, place
+    )
