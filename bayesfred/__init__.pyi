@@ -26,7 +26,7 @@ from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MeasuredPSF, MoffatPSF, SampledPSF
 from .model.drift import Drift
 from .model.joint import JointPosterior
-from .model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
+from .model.noise import BackgroundNoise, FlatFieldNoise, GaussianNoise, PoissonNoise, simulate
 from .model.parameters import Nuisances
 from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
@@ -59,6 +59,7 @@ __all__ = [
     "Drift",
     "Evidence",
     "ExtrapolationWarning",
+    "FlatFieldNoise",
     "ForwardModel",
     "GaussianNoise",
     "GaussianPSF",

@@ -18,8 +18,9 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFFile, PSFToMeasure, has_pixel
 from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
+from bayesfred.io.pixel_maps import PixelMaps, read_maps
 from bayesfred.model import priors
-from bayesfred.model.noise import Noise, PoissonNoise, simulate
+from bayesfred.model.noise import FlatFieldNoise, Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
 from bayesfred.settings.joint import JointRun
 from bayesfred.settings.simulation import SimulationSettings
@@ -32,9 +33,10 @@ def inputs(
     run: settings.RunSettings | JointRun, run_file: Path, sections: Sequence[str] = SECTIONS
 ) -> list[Path]:
     """The run file, and the files that its sections name, whether they are there or not."""
-    runs = run.frames.values() if isinstance(run, JointRun) else (run,)
+    runs = tuple(run.frames.values()) if isinstance(run, JointRun) else (run,)
     named = (getattr(getattr(own, part), "path", None) for own in runs for part in sections)
-    files = dict.fromkeys(path for path in named if path)  # frames may have one catalogue
+    maps = (path for own in runs for path in own.frame.maps.values())
+    files = dict.fromkeys(path for path in (*named, *maps) if path)  # frames may share them
     return [run_file, *(resolve(path, run_file) for path in files)]
 
 
@@ -96,17 +98,45 @@ def priors_given(run: settings.RunSettings | JointRun) -> dict[str, Any]:
     return {name: priors.make(name, p.distribution, p.keywords) for name, p in run.prior.items()}
 
 
-def noise_given(run: settings.RunSettings, read_noise: float | None) -> tuple[Noise, str]:
-    """The noise of [noise], and a line of what becomes of the read noise in a frame's header.
+def maps_given(run: settings.RunSettings, run_file: Path) -> PixelMaps:
+    """The maps of pixels that [frame] names."""
+    named = run.frame.maps.items()
+    return read_maps({name: resolve(path, run_file, must_exist=True) for name, path in named})
 
-    Where [noise] does not say a read noise, it is the header's.
+
+def noise_given(
+    run: settings.RunSettings, run_file: Path, maps: PixelMaps, read_noise: float | None = None
+) -> tuple[Noise, str]:
+    """The noise of [noise] and of maps, and a line of what becomes of the header's read noise.
+
+    Where neither [noise] nor a map says a read noise, it is the header's.
     """
     noise: Noise = run.noise.make()
-    if not read_noise or getattr(noise, "read_noise", None) == read_noise:
-        return noise, ""
-    if isinstance(noise, PoissonNoise) and "read_noise" not in run.noise.model_fields_set:
-        return PoissonNoise(read_noise), f"read noise: {read_noise:g} e-, from the header"
-    return noise, f"read noise: {read_noise:g} e- of the header not used, as [noise] says the noise"
+    stated = "read_noise" in run.noise.model_fields_set
+    for name in ("flat", "variance"):
+        if getattr(maps, name) is not None and not isinstance(noise, PoissonNoise):
+            raise InputError(
+                f"{run_file}: frame.{name}: got it with noise.kind = {run.noise.kind!r}, expected "
+                f"'poisson': leave out frame.{name}, or [noise]"
+            )
+    if maps.read_noise is not None:
+        if stated:
+            raise InputError(
+                f"{run_file}: frame.variance: got it with noise.read_noise, expected one of the "
+                "two: leave one out"
+            )
+        noise, read_noise = PoissonNoise(maps.read_noise), None
+    line = ""
+    if read_noise and getattr(noise, "read_noise", None) != read_noise:
+        line = f"read noise: {read_noise:g} e- of the header not used, as [noise] says the noise"
+        if isinstance(noise, PoissonNoise) and not stated:
+            noise, line = (
+                PoissonNoise(read_noise),
+                f"read noise: {read_noise:g} e-, from the header",
+            )
+    if maps.flat is not None:
+        noise = FlatFieldNoise(cast(PoissonNoise, noise), maps.flat)
+    return noise, line
 
 
 def posterior_given(
@@ -159,10 +189,16 @@ def simulated(run: settings.RunSettings, run_file: Path, seed: int) -> tuple[Pos
             f"{', '.join(model.distortion.names)}"
         )
     theta = np.array([s.theta.get(name, 0.0) for name in model.distortion.names])
-    noise = run.noise.make()
+    maps = maps_given(run, run_file)
+    noise, _ = noise_given(run, run_file, maps)
+    if maps.valid is not None and maps.valid.shape != s.shape:
+        raise InputError(
+            f"{run_file}: simulation.shape: got {s.shape}, expected {maps.valid.shape}, that of "
+            f"{maps.description}"
+        )
     with naming(run_file):
         counts = simulate(model, theta, s.background, seed=seed, noise=noise)
-        posterior = posterior_given(run, model, counts, None, noise)
+        posterior = posterior_given(run, model, counts, maps.valid, noise)
     known = {**dict(zip(model.distortion.names, theta, strict=True)), "background": s.background}
     known |= {"flux_scale": 1.0, "psf_sigma": model.psf.sigma}
     truth = np.array([known.get(name, 0.0) for name in posterior.parameter_names])

@@ -171,7 +171,7 @@ def bright(
     if not isinstance(noise, PoissonNoise):
         raise InputError(
             f"{run_file}: noise: got {type(noise).__name__} with marks = 'dots', expected kind = "
-            "'poisson', whose read noise is used"
+            "'poisson', whose read noise is used, and no frame.flat"
         )
     counts, variance = invert_dots(frame.counts, frame.valid)
     return counts, GaussianNoise(variance + noise.read_noise**2)

@@ -97,7 +97,7 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
     run_file = Path(run_file)
     run = settings.read_settings(run_file)
     simulation = build.simulation(run, run_file)
-    if run.frame.gain is not None or run.frame.pedestal:
+    if run.frame.gain not in (None, 1.0) or run.frame.pedestal or run.frame.gain_map:
         raise InputError(
             f"{run_file}: frame.gain: got a gain or a pedestal, expected neither, because counts "
             "are written: remove them"
@@ -114,7 +114,8 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
         s = posterior.model.sources
         record = CatalogueRecord(s.x, s.y, s.flux)
         write_catalogue(catalogue, record, overwrite=overwrite)
-    write_frame(frame, posterior.counts, overwrite=overwrite)
+    recorded = posterior.counts * getattr(posterior.noise, "response", 1.0)
+    write_frame(frame, recorded, overwrite=overwrite)
     return Simulated(posterior, truth, frame, catalogue if grid else None)
 
 

@@ -15,7 +15,8 @@ from bayesfred.build import naming
 from bayesfred.commands.records import Result
 from bayesfred.commands.results import How, Job, Say, make_chain, write_results
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
-from bayesfred.io import frames, outputs, paths
+from bayesfred.io import outputs, paths
+from bayesfred.io.pixel_maps import read_mapped_frame
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import approach, find_map, reject_outliers
@@ -65,10 +66,11 @@ def read_frame(
 
     f = run.frame
     path = paths.resolve(f.path, run_file, must_exist=True)
-    frame = frames.read_frame(
-        path, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
+    maps = build.maps_given(run, run_file)
+    frame = read_mapped_frame(
+        path, maps, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
-    noise, line = build.noise_given(run, frame.read_noise)
+    noise, line = build.noise_given(run, run_file, maps, frame.read_noise)
     note(frame.description, line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = psf or build.reference_psf(run, run_file)

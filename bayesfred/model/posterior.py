@@ -44,7 +44,7 @@ class Posterior(FrameDensity):
         independent a priori. A distortion that leaves a source without an image, or folds the frame
         (D <= 0) within two of the PSF's widths of one, has probability zero.
     noise : Noise
-        `PoissonNoise`, `GaussianNoise`, `BackgroundNoise` or a model of your own.
+        `PoissonNoise`, `FlatFieldNoise`, `GaussianNoise`, `BackgroundNoise` or a model of your own.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is to be used.
     nuisances : Nuisances

@@ -33,6 +33,13 @@ class FrameSettings(Section):
         Pixels at or above this level are masked; by default the header's, or what seems saturated.
     name : str, optional
         FITS extension or HDF5 dataset.
+    gain_map : str, optional
+        The file of the gain of every pixel, in place of `gain`.
+    flat : str, optional
+        The file of a flat field, the relative response of every pixel, by which counts are divided.
+        Pixels where it is not between 0.01 and 100, such as dead ones, are masked.
+    variance : str, optional, e-^2
+        The file of a map of the read-out's variance, whose root is the read noise.
     reject_outliers : bool
         Whether unmatched sources and spurious detections are left out:
         `bayesfred.reject_outliers`.
@@ -43,7 +50,22 @@ class FrameSettings(Section):
     pedestal: Float | None = None
     saturation: Float | None = None
     name: Name | None = None
+    gain_map: Name | None = None
+    flat: Name | None = None
+    variance: Name | None = None
     reject_outliers: bool = False
+
+    @property
+    def maps(self) -> dict[str, str]:
+        """The files of maps of the pixels, by name."""
+        given = {"gain": self.gain_map, "flat": self.flat, "variance": self.variance}
+        return {name: path for name, path in given.items() if path is not None}
+
+    @model_validator(mode="after")
+    def _one_gain(self) -> FrameSettings:
+        if self.gain is not None and self.gain_map is not None:
+            raise ValueError("gain_map: got it with gain, expected one of the two: leave one out")
+        return self
 
 
 class TargetSettings(Section):

@@ -3,6 +3,7 @@
 `protocol.py` says what a noise model is.
 """
 
+from bayesfred.model.noise.flat_field import FlatFieldNoise
 from bayesfred.model.noise.gaussian import BackgroundNoise, GaussianNoise
 from bayesfred.model.noise.model_error import ModelErrorNoise, model_error_terms
 from bayesfred.model.noise.poisson import PoissonNoise
@@ -11,6 +12,7 @@ from bayesfred.model.noise.simulation import simulate
 
 __all__ = [
     "BackgroundNoise",
+    "FlatFieldNoise",
     "GaussianNoise",
     "ModelErrorNoise",
     "Noise",

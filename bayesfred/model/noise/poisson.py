@@ -81,7 +81,8 @@ class PoissonNoise(Noise):
     Counts are Poisson(mean) without read noise, and with it the sum of such a number and a normal
     one: their density is the convolution of the two distributions. Counts are electrons, so that
     a gain map is applied to the frame (counts = (adu - pedestal) * gain) and to the read noise
-    (electrons = adu * gain) before they are given here.
+    (electrons = adu * gain) before they are given here. Counts that were divided by a flat field
+    are no longer Poisson: see `FlatFieldNoise`.
 
     Parameters
     ----------
@@ -218,7 +219,7 @@ class PoissonNoise(Noise):
         return 2.0 + inverse * inverse * mean - inverse * explained
 
     def cumulative(
-        self, counts: Floats, mean: Floats, background: float | Floats, grain: float
+        self, counts: Floats, mean: Floats, background: float | Floats, grain: float | Floats
     ) -> tuple[Floats, Floats]:
         if not self.discrete:
             half = 0.5 * grain
@@ -226,7 +227,7 @@ class PoissonNoise(Noise):
                 blurred_cdf(counts - half, mean, self.read_noise),
                 blurred_cdf(counts + half, mean, self.read_noise),
             )
-        half = 0.5 * max(grain, 1.0)
+        half = 0.5 * np.maximum(grain, 1.0)
         return poisson_cdf(counts - half, mean), poisson_cdf(counts + half, mean)
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
