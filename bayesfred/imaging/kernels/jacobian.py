@@ -22,8 +22,8 @@ from bayesfred.imaging.kernels.geometry import (
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.products import (
     fill_second_derivatives,
+    is_product_row,
     lines_of,
-    product_basis_row,
 )
 from bayesfred.imaging.kernels.psf_dispatch import (
     psf_of_source,
@@ -355,7 +355,7 @@ def add_jacobian_rows(layout, basis, flux, first, last, out):
             j, low, n = numbers[p], lows[p], sizes[p]
             if not first <= j < last:
                 continue
-            if not product_basis_row(lines, monomials, inverse, j, low, basis_rows[:, :n]):
+            if not is_product_row(lines, monomials, inverse, (j, low, n), basis_rows):
                 u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
                 basis_row(rows, source, u, v, n, np.int64(0))
             for k in range(index.size):

