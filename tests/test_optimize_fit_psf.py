@@ -10,7 +10,8 @@ import bayesfred as bf
 from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
 from bayesfred.model.kernels.psf_samples import SourceSamples
 from bayesfred.model.psf_errors import PsfErrors
-from bayesfred.optimize.fit_psf import solved, starting_state
+from bayesfred.optimize.fit_psf import find_psf, solved, starting_state
+from bayesfred.optimize.psf_equations import shared_information
 from bayesfred.optimize.psf_levels import PsfGrid
 from bayesfred.optimize.psf_samples import PsfSamples
 
@@ -227,7 +228,7 @@ def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
 
 @pytest.mark.long
 def test_errors_of_the_psf_are_those_of_a_joint_fit():
-    """The former come from gradients at drawn PSFs, the joint fit from one matrix."""
+    """The former come from draws of the PSF, the joint fit from one matrix."""
     _, _, posterior = frame_of(bf.MoffatPSF(1.2, 4.765), 1.2, side=4)
     estimate = bf.find_map(posterior)
     measured, known = bf.measure_psf(posterior, estimate)
@@ -304,6 +305,28 @@ def test_what_a_psf_adds_is_that_of_a_joint_fit():
     assert not np.any(moved == errors.displacements(20_000, 2))
     scale = PsfErrors.of(("a", "b", "position_scatter"), i, draws @ k.T)
     assert not np.any(scale.covariance[2]) and np.all(np.diag(scale.covariance)[:2] > 0.0)
+
+
+def test_what_a_psf_shares_with_parameters_is_the_slope_of_their_gradient():
+    """Of counts without noise, whose residuals do not change with the PSF's slopes."""
+    _, _, posterior = frame_of(bf.MoffatPSF(3.0, 4.765), 3.0, side=4)
+    psf, state, drawn = find_psf(posterior, bf.find_map(posterior), 4, 1)
+    bare = posterior.with_psf(psf)
+    params = bf.find_map(bare).params
+    bare = replace(bare, counts=bare.expected_counts(params))
+
+    def gradient(deviations):
+        coefficients = state.grid.combined(state.deviating(state.deviations + deviations))
+        return bare.with_psf(replace(psf, coefficients=coefficients, draws=None)).gradient(params)
+
+    differences = np.array([gradient(0.1 * d) - gradient(-0.1 * d) for d in drawn[:4]]) / -0.2
+    size = np.sqrt(np.diag(bare.information(params)))
+    found = drawn[:4] @ shared_information(bare, state, params)
+    np.testing.assert_allclose(found / size, differences / size, atol=0.01)
+    assert np.abs(found / size).max() > 0.5
+    fixed = replace(bare, nuisances=replace(bare.nuisances, flux="fixed"))
+    alone = drawn[:4] @ shared_information(fixed, state, params)
+    assert not np.allclose(alone / size, differences / size, atol=0.01)
 
 
 @pytest.mark.long

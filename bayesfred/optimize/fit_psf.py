@@ -91,6 +91,28 @@ def fit_psf(
     >>> abs(psf.sigma - math.hypot(1.2, 12**-0.5)) < 0.01  # the pixel is in it
     True
     """
+    return find_psf(posterior, estimate, oversampling, degree)[0]
+
+
+def find_psf(
+    posterior: Posterior, estimate: MapEstimate, oversampling: int, degree: int
+) -> tuple[MeasuredPSF, PsfState, Floats]:
+    """Measure the PSF as `fit_psf` does, and keep what its errors are made of.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    estimate : MapEstimate
+    oversampling, degree : int
+
+    Returns
+    -------
+    psf : MeasuredPSF
+    state : PsfState
+        Where the PSF was found.
+    drawn : ndarray, shape (draws, deviations)
+        What the draws from the PSF's posterior add to the state's deviations.
+    """
     check_choices(oversampling, degree)
     if posterior.model.detector.binning != 1:
         raise InputError(
@@ -258,20 +280,23 @@ def _with_wings(posterior: Posterior, state: PsfState) -> PsfState:
     )
 
 
-def _measured(posterior: Posterior, equations: PsfEquations) -> MeasuredPSF:
-    """The PSF at the solution, with draws from its posterior."""
+def _measured(
+    posterior: Posterior, equations: PsfEquations
+) -> tuple[MeasuredPSF, PsfState, Floats]:
+    """The PSF at the solution, its state, and draws from its posterior."""
     state = equations.state
     size = state.deviations.size
-    there = state.deviations + equations.step[:size]
-    drawn = [
-        state.grid.combined(state.deviating(there + deviation))
-        for deviation in equations.draws(DRAWS)[:size].T
-    ]
-    return MeasuredPSF(
-        state.grid.combined(state.deviating(there)),
+    there = state.deviating(state.deviations + equations.step[:size])
+    state = replace(state, coefficients=there)
+    drawn = equations.draws(DRAWS)[:size].T
+    psf = MeasuredPSF(
+        state.grid.combined(there),
         state.grid.oversampling,
         field_radius(posterior),
-        draws=np.array(drawn),
+        draws=np.array(
+            [state.grid.combined(state.deviating(state.deviations + one)) for one in drawn]
+        ),
         model_error=equations.model_error,
         determined=float(equations.determined().sum()),
     )
+    return psf, state, drawn

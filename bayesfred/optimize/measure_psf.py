@@ -13,8 +13,9 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
-from bayesfred.optimize.fit_psf import fit_psf
+from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import maximize
+from bayesfred.optimize.psf_equations import shared_information
 
 LARGEST_ERROR = 0.1  # where the search for a model error begins: with more, misfits grow
 
@@ -69,7 +70,7 @@ def measure_psf(
     >>> estimate.fits_data, measured.fits_data
     (False, True)
     """
-    psf = fit_psf(posterior, estimate, oversampling=oversampling, degree=degree)
+    psf, state, drawn = find_psf(posterior, estimate, oversampling, degree)
     bare = posterior.with_psf(psf)
     known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
     if model_error:
@@ -86,7 +87,11 @@ def measure_psf(
             "let the PSF vary less over the field (degree)"
         )
     top = maximize(bare, start)
-    measured = _marginalized(bare, psf, top.params, psf.determined)
+    if bare.model.optics().translates:
+        slopes = drawn @ shared_information(bare, state, top.params)
+    else:
+        slopes = _gradients(bare, psf, top.params)
+    measured = _marginalized(bare, slopes, top.params, psf.determined)
     return measured, find_map(measured, top.params)
 
 
@@ -130,7 +135,8 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
             f"psf: got {type(psf).__name__} without draws, expected a MeasuredPSF with its errors: "
             "fit_psf makes one"
         )
-    return _marginalized(replace(posterior, psf_errors=None), psf, estimate.params, 0.0)
+    bare = replace(posterior, psf_errors=None)
+    return _marginalized(bare, _gradients(bare, psf, estimate.params), estimate.params, 0.0)
 
 
 def psf_message(posterior: Posterior) -> str:
@@ -157,16 +163,20 @@ def psf_message(posterior: Posterior) -> str:
     )
 
 
-def _marginalized(
-    posterior: Posterior, psf: MeasuredPSF, centre: Floats, absorbed: float
-) -> Posterior:
+def _gradients(posterior: Posterior, psf: MeasuredPSF, centre: Floats) -> Floats:
+    """The gradient with every PSF that was drawn, shape (draws, d)."""
     likelihood, model = posterior.likelihood, posterior.model
-    slopes = np.array(
+    return np.array(
         [
             replace(likelihood, model=replace(model, psf=drawn)).gradient(centre)
             for drawn in psf.drawn()
         ]
     )
+
+
+def _marginalized(
+    posterior: Posterior, slopes: Floats, centre: Floats, absorbed: float
+) -> Posterior:
     slopes = slopes[np.isfinite(slopes).all(axis=1)]
     information = posterior.information(centre)
     errors = PsfErrors.of(posterior.parameter_names, information, slopes, absorbed)

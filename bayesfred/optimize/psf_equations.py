@@ -33,6 +33,7 @@ from bayesfred.optimize.psf_samples import (
 )
 
 OUTLYING = 6.0  # standard deviations beyond which a pixel counts less
+TOGETHER = 512  # rows of a matrix
 PROBES = 40  # draws from which the number of determined coefficients is estimated
 FASTEST = 30.0  # factor by which a strength may change in a turn
 SCATTER, WIDTH = "position_scatter", "psf_sigma"
@@ -90,9 +91,10 @@ class PsfInformation:
     Attributes
     ----------
     matrix : ndarray, shape (unknowns, unknowns)
+        Its lower triangle.
     which : ndarray of int
         The templates whose fluxes and shifts are eliminated.
-    outer : ndarray, shape (unknowns, eliminated)
+    outer : ndarray, shape (eliminated, unknowns)
         What they share with the others.
     response : ndarray, shape (eliminated, unknowns)
         How they follow the others.
@@ -124,23 +126,24 @@ class PsfInformation:
         inner[idle, idle] = 1.0
         size = len(half)
         joint = np.empty((size + len(inner), size + len(inner)))
-        joint[:size, :size] = half
-        joint[:size, :size] += half.T
-        joint[:size, size:] = coupling.T @ columns + offset @ select
-        joint[size:, :size] = joint[:size, size:].T
+        np.add(half, half.T, out=joint[:size, :size])
+        joint[size:, :size] = (coupling.T @ columns + offset @ select).T
         joint[size:, size:] = inner
         free = np.zeros((len(state.fluxes), 3), bool)
         free[:, 0] = posterior.nuisances.flux == "free"
         free[:, 1:] = posterior.nuisances.position_scatter
         which = np.flatnonzero(free.ravel() & (own.diagonal() > 0.0))
         if not which.size:
-            return cls(joint, which, np.zeros((len(joint), 0)), np.zeros((0, len(joint))), np.copy)
+            none = np.zeros((0, len(joint)))
+            return cls(joint, which, none, none, np.copy)
         precision = _shift_precision(posterior, state)[which]
         solve = splu((own[which][:, which] + sparse.diags_array(precision)).tocsc()).solve
-        shared = columns.T @ own[:, which] + (with_background[which] @ select).T
-        outer = np.concatenate([coupling[which].T, shared])
-        response = solve(outer.T)
-        joint -= outer @ response
+        shared = own[which] @ columns + with_background[which] @ select
+        outer = np.concatenate([coupling[which], shared], axis=1)
+        response = solve(outer)
+        for begin in range(0, len(joint), TOGETHER):
+            end = begin + TOGETHER
+            joint[begin:end, :end] -= outer[:, begin:end].T @ response[:, :end]
         return cls(joint, which, outer, response, solve)
 
 
@@ -179,8 +182,9 @@ class PsfEquations:
 
         With equations that are `known` at a state nearby their information serves once more.
         """
-        pixels = _pixels(posterior, state, exact)
-        data, score = pixels.data, pixels.score
+        data = PsfSamples.at(posterior, state.params, state.shifts, state.grid.radius)
+        pixels = _pixels(posterior, state, data, 0.0 if exact else None)
+        score = pixels.score
         information = known.information if known else PsfInformation.of(posterior, state, pixels)
         psf = psf_slope(state.grid.unknown, pixels.terms, data.samples, state.fluxes, score)
         own = template_pulls(data, pixels.templates, score, len(state.fluxes))
@@ -192,7 +196,7 @@ class PsfEquations:
         shifts = np.column_stack([state.fluxes, state.shifts]).ravel()
         own -= _shift_precision(posterior, state) * shifts
         step = information.solve(own[information.which])
-        pull = np.concatenate([psf, inner]) - information.outer @ step
+        pull = np.concatenate([psf, inner]) - step @ information.outer
         out = cls(state, information, pull, step, pixels.model_error)
         if known and known.state.strengths is state.strengths:
             out.__dict__["factor"] = known.factor  # of the same matrix
@@ -206,7 +210,7 @@ class PsfEquations:
 
     @cached_property
     def factor(self) -> tuple[Floats, Floats]:
-        """Cholesky's factor of the information with the priors, and the unknowns' scales."""
+        """Cholesky's upper factor of the information with the priors, and the unknowns' scales."""
         matrix = self.information.matrix.copy()
         for block, strength in zip(self.state.grid.blocks, self.state.strengths, strict=True):
             n = np.arange(len(matrix))[block.where]
@@ -219,15 +223,27 @@ class PsfEquations:
         matrix *= scale
         # makes directions definite that the conventions will fix
         matrix += rows.T @ (rows / (rows**2).sum(axis=1)[:, None])
-        return linalg.cholesky(matrix, lower=True, overwrite_a=True), scale
+        # LAPACK's matrices are the transposed ones: their upper triangle
+        return linalg.cholesky(matrix.T, overwrite_a=True, check_finite=False), scale
+
+    def _solved(self, pull: Floats) -> Floats:
+        """The product of the information's inverse, without conventions, with columns."""
+        upper, scale = self.factor
+        columns = (scale * pull.T).T
+        return np.asarray(
+            (scale * linalg.cho_solve((upper, False), columns, check_finite=False).T).T
+        )
 
     def _constrained(self, solution: Floats, target: Floats) -> Floats:
         """The solution that meets the conventions and is nearest by the information."""
-        rows = self.conventions
-        lower, scale = self.factor
-        towards = scale[:, None] * linalg.cho_solve((lower, True), scale[:, None] * rows.T)
+        rows, towards = self.conventions, self._towards
         excess = np.linalg.solve(rows @ towards, rows @ solution - target)
         return np.asarray(solution - towards @ excess)
+
+    @cached_property
+    def _towards(self) -> Floats:
+        """How the unknowns follow the conventions."""
+        return self._solved(self.conventions.T)
 
     @cached_property
     def step(self) -> Floats:
@@ -237,22 +253,20 @@ class PsfEquations:
         for block, strength in zip(state.grid.blocks, state.strengths, strict=True):
             own = state.deviations[block.where]
             pull[:size][block.where] -= strength * (block.roughness @ own) + block.amplitude * own
-        lower, scale = self.factor
-        free = scale * linalg.cho_solve((lower, True), scale * pull)
         target = -state.grid.conventions @ state.coefficients
         target[0] += 1.0
-        return self._constrained(free, target)
+        return self._constrained(self._solved(pull), target)
 
     def along(self, other: Floats) -> float:
         """The product of the step with another, in standard deviations of all unknowns together."""
-        lower, scale = self.factor
-        return float((lower.T @ (self.step / scale)) @ (lower.T @ (other / scale)))
+        upper, scale = self.factor
+        return float((upper @ (self.step / scale)) @ (upper @ (other / scale)))
 
     def draws(self, number: int) -> Floats:
         """Draws from the posterior of all unknowns, less its maximum, a column each."""
-        lower, scale = self.factor
+        upper, scale = self.factor
         normal = np.random.default_rng(0).standard_normal((len(scale), number))
-        free = scale[:, None] * linalg.solve_triangular(lower, normal, trans=1, lower=True)
+        free = scale[:, None] * linalg.solve_triangular(upper, normal, check_finite=False)
         return self._constrained(free, np.zeros((len(self.conventions), number)))
 
     def determined(self) -> Floats:
@@ -275,14 +289,52 @@ class PsfEquations:
         return replace(self, state=replace(state, strengths=np.clip(best, *LIMITS)))
 
 
+def shared_information(posterior: Posterior, state: PsfState, params: Floats) -> Floats:
+    """The information that a PSF's deviations share with a posterior's parameters.
+
+    Fluxes and shifts of single sources follow. The noise is the posterior's own, and no pixel
+    counts less. As in all equations here, f and g change with a coefficient over a source's image
+    as they do in its middle: that is exact where they do not depend on u and v.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With the PSF.
+    state : PsfState
+        Where the PSF was found.
+    params : ndarray, shape (d,)
+        Maximum of the posterior.
+
+    Returns
+    -------
+    ndarray, shape (deviations, d)
+    """
+    grid = state.grid
+    _, _, fluxes, shifts = posterior.likelihood.own_pixels(params, grid.radius)
+    state = replace(state, params=params, fluxes=fluxes, shifts=shifts)
+    known = dict(zip(posterior.parameter_names, params, strict=True))
+    # what the equations of a PSF leave out in the corners of the grids is part of the PSF
+    corner = math.sqrt(0.5) * float(np.max((grid.levels.side + 4) * grid.levels.spacing))
+    data = PsfSamples.at(posterior, params, shifts, corner)
+    pixels = _pixels(posterior, state, data, known.get("model_error", 0.0), math.inf)
+    size = state.deviations.size
+    return np.asarray(PsfInformation.of(posterior, state, pixels).matrix[size:, :size].T)
+
+
 def field_radius(posterior: Posterior) -> float:
     """Half the frame's diagonal, pixel."""
     return 0.5 * math.hypot(*posterior.model.detector.fine_shape)
 
 
-def _pixels(posterior: Posterior, state: PsfState, exact: bool) -> Pixels:
+def _pixels(
+    posterior: Posterior,
+    state: PsfState,
+    data: PsfSamples,
+    error: float | None,
+    outlying: float = OUTLYING,
+) -> Pixels:
+    """What the pixels say; without a model error that is given the residuals tell it."""
     grid, fluxes, sources = state.grid, state.fluxes, posterior.model.sources
-    data = PsfSamples.at(posterior, state.params, state.shifts, grid.radius)
     seen = int(np.sum(np.diff(data.samples.first) > 0))
     if seen <= len(state.params) + 10:
         raise InputError(
@@ -295,9 +347,9 @@ def _pixels(posterior: Posterior, state: PsfState, exact: bool) -> Pixels:
     templates = data.samples.size * np.stack([p[0], -bright * p[1], -bright * p[2]])
     light = data.image(bright * templates[0])
     residual, variance = data.residual(posterior, state.params, light)
-    error = 0.0 if exact else _model_error(residual, variance, light)
+    error = _model_error(residual, variance, light) if error is None else error
     variance = variance + (error * light) ** 2
-    weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * OUTLYING**2)))
+    weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * outlying**2)))
     return Pixels(data, terms, templates, weight, weight * residual, error)
 
 

@@ -25,7 +25,7 @@ from scipy import sparse
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.psf.measured import field_powers
-from bayesfred.model.kernels.psf_normal import Levels
+from bayesfred.model.kernels.psf_normal import Levels, halved
 
 FIELD_RADIUS = 5.0  # of the grid for the variation over the field, widths of the PSF
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
@@ -153,7 +153,8 @@ class PsfGrid:
             part = coefficients[begin : begin + terms * side**2].reshape(side, side, terms)
             part = np.moveaxis(part, 2, 0)
             for _ in range(round(levels.spacing[k] * self.oversampling).bit_length() - 1):
-                part = _halved(part)
+                finer = halved(part.shape[1])
+                part = finer @ part @ finer.T
             parts.append((int(levels.low[k]), part))
         n = max(part.shape[1] for _, part in parts)
         out = np.zeros((len(field_powers(self.degree)), n, n))
@@ -172,12 +173,3 @@ def _roughness(envelope: Floats, n: int) -> sparse.csr_array:
     slope = sparse.diags_array([-first, first[1:]], offsets=[0, 1])
     xx, yy, xy = sparse.kron(one, second), sparse.kron(second, one), sparse.kron(slope, slope)
     return sparse.csr_array(inverse @ (xx.T @ xx + yy.T @ yy + 2.0 * xy.T @ xy) @ inverse)
-
-
-def _halved(c: Floats) -> Floats:
-    """The same cubic splines on knots half as far apart, shape (terms, 2 n + 3, 2 n + 3)."""
-    n = c.shape[1]
-    mask = np.zeros((2 * n + 3, n))
-    for k, share in enumerate((1.0, 4.0, 6.0, 4.0, 1.0)):
-        mask[2 * np.arange(n) + k, np.arange(n)] = share / 8.0
-    return np.asarray(mask @ c @ mask.T)

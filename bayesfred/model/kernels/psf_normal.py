@@ -10,26 +10,46 @@ and a pixel's row of the design matrix is the sum over its samples: overlapping 
 row. Beside c every source has three templates: its kernel K, and the derivatives X and Y of its
 light as it is shifted along a and along b. The distortion's coefficients act through X and Y, so
 the equations hold for them too.
+
+Within a source the terms of the field are constant. So its samples make one matrix of 16 by 16
+products each, and the products of the terms multiply that matrix as a whole:
+
+    information[(knot, t), (knot', t')] = sum_s P_t(s) P_t'(s) gram_s[knot, knot']
+
+of many sources at once this is a matrix product. A level h has a spline on knots 2 h apart as an
+exact sum of finer ones, so that what two levels share follows from the grams of the finer one.
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.fastmath import FAST
+from bayesfred.model.kernels.psf_grids import (
+    EDGE,
+    NEAR,
+    ROWS,
+    add_crosses,
+    add_light,
+    add_spline,
+    add_squares,
+    add_values,
+)
+from bayesfred.model.kernels.psf_pairs import TEMPLATES, add_pairs
+from bayesfred.model.kernels.psf_samples import SourceSamples
 
-KNOTS = 16  # B-splines that are not zero at a point
-TEMPLATES = 3
-NEAR = 7  # columns on which B-splines overlap one
-TOGETHER = 64  # sources
-LINES = 4096  # pixels
+ROOM = 2**20  # numbers that the matrices of several sources together have at most
+HALVED = (1.0, 4.0, 6.0, 4.0, 1.0)  # a cubic B-spline in those on knots half as far apart, eighths
 
 
 class Levels(NamedTuple):
-    """The grids of B-splines; coefficient (knot, t) of level l is start + knot (high - low) + t."""
+    """The grids of B-splines; coefficient (knot, t) of level l is start + knot (high - low) + t.
+
+    The first grid is the fine one. What varies over the field is on one twice as coarse; wings are
+    on a coarser one, and do not vary.
+    """
 
     start: Ints  # (l,) a level's first coefficient
     side: Ints  # (l,) knots along one axis
@@ -37,364 +57,328 @@ class Levels(NamedTuple):
     high: Ints  # (l,) the term after the last
     spacing: Floats  # (l,) pixel
 
+    def size(self) -> int:
+        """How many coefficients there are."""
+        return int(self.start[-1] + self.side[-1] ** 2 * (self.high[-1] - self.low[-1]))
 
-@inner()
-def _splines(x, side, weights, slopes):
-    """The first of the four knots around x (knots from the middle), and their splines at x."""
-    x = x + 0.5 * (side - 1)
-    i = np.int64(np.floor(x))
-    f = x - i
-    g = 1.0 - f
-    weights[0], weights[3] = g * g * g / 6.0, f * f * f / 6.0
-    weights[1] = 2.0 / 3.0 - f * f * (1.0 - 0.5 * f)
-    weights[2] = 2.0 / 3.0 - g * g * (1.0 - 0.5 * g)
-    slopes[0], slopes[3] = -0.5 * g * g, 0.5 * f * f
-    slopes[1], slopes[2] = f * (1.5 * f - 2.0), -g * (1.5 * g - 2.0)
-    return i - 1
+    def terms(self, k: int) -> slice:
+        """The terms of the field that level k has."""
+        return slice(int(self.low[k]), int(self.high[k]))
+
+    def shape(self, k: int) -> tuple[int, int, int]:
+        """Of level k's coefficients: knots along b and along a, terms."""
+        return int(self.side[k]), int(self.side[k]), int(self.high[k] - self.low[k])
+
+    def where(self, k: int) -> slice:
+        """Where level k's coefficients are."""
+        return slice(int(self.start[k]), int(self.start[k]) + math.prod(self.shape(k)))
+
+    def part(self, k: int, values: Floats) -> Floats:
+        """Level k's own along the last axis, shape (..., side, side, terms)."""
+        return values[..., self.where(k)].reshape(*values.shape[:-1], *self.shape(k))
+
+    def block(self, k: int, other: int, matrix: Floats) -> Floats:
+        """What two levels share, shape (side, side, terms, side, side, terms)."""
+        own = matrix[self.where(k), self.where(other)]
+        return own.reshape(*self.shape(k), *self.shape(other))
 
 
-@entry()
-def sample_psf(levels, field, samples, coefficients):
-    """p, p_a and p_b at every sample, shape (3, samples), per square pixel."""
-    out = np.zeros((3, samples.source.size))
-    wx, wy, dx, dy = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    for level in range(levels.side.size):
-        side, h = levels.side[level], levels.spacing[level]
-        low, high, start = levels.low[level], levels.high[level], levels.start[level]
-        for n in range(samples.source.size):
-            i = _splines(samples.a[n] / h, side, wx, dx)
-            j = _splines(samples.b[n] / h, side, wy, dy)
-            terms = field[samples.source[n]]
-            for q in range(max(0, -j), min(4, side - j)):
-                for p in range(max(0, -i), min(4, side - i)):
-                    at = start + ((j + q) * side + i + p) * (high - low)
-                    c = 0.0
-                    for t in range(high - low):
-                        c += coefficients[at + t] * terms[low + t]
-                    out[0, n] += c * wx[p] * wy[q]
-                    out[1, n] += c * dx[p] * wy[q] / h
-                    out[2, n] += c * wx[p] * dy[q] / h
+class _Kinds(NamedTuple):
+    """Which levels are which, by number."""
+
+    levels: Levels
+    narrow: list[int]  # all but the wings
+    varying: list[int]
+    wings: list[int]
+    side: int  # of a fine grid that has room for all but the wings
+
+    @classmethod
+    def of(cls, levels: Levels) -> "_Kinds":
+        every = range(levels.side.size)
+        varying = [k for k in every if levels.low[k] > 0]
+        wings = [k for k in every if levels.spacing[k] > levels.spacing[0] and k not in varying]
+        sides = [int(levels.side[0]), *(2 * int(levels.side[k]) + 3 for k in varying)]
+        narrow = [k for k in every if k not in wings]
+        return cls(levels, narrow, varying, wings, max(sides))
+
+    def inside(self, side: int) -> slice:
+        """Where so many knots are among those of the fine grid."""
+        edge = (self.side - side) // 2
+        return slice(edge, self.side - edge)
+
+    def refined(self, side: int) -> Floats:
+        """The matrix from a coarser grid's coefficients along an axis to those on the fine grid."""
+        out = np.zeros((self.side, side))
+        out[self.inside(2 * side + 3)] = halved(side)
+        return out
+
+    def on_level(self, k: int, sums: Floats) -> Floats:
+        """Sums of the fine grid's splines, along the last two axes, as those of a level's."""
+        side = int(self.levels.side[k])
+        if k not in self.varying:
+            return sums[..., self.inside(side), self.inside(side)]
+        finer = self.refined(side)
+        return np.asarray(finer.T @ sums @ finer)
+
+
+def halved(side: int) -> Floats:
+    """The matrix from splines' coefficients to those on knots half as far apart, a row each."""
+    out = np.zeros((2 * side + 3, side))
+    for k, share in enumerate(HALVED):
+        out[2 * np.arange(side) + k, np.arange(side)] = share / 8.0
     return out
 
 
-@inner()
-def _wide(levels):
-    """The number of the level of wings, which comes last; of levels where there is none."""
-    last = levels.side.size - 1
-    return last if last > 0 and levels.low[last] == 0 else last + 1
+def _padded(side: int) -> int:
+    return side + 2 * EDGE
 
 
-class _Runs(NamedTuple):
-    """The coefficients that one pixel depends on, as runs of neighbouring ones."""
-
-    begin: Ints  # a run's first coefficient
-    sample: Ints  # the sample that a run of a level that varies is of; -1 of other levels
-    first: Ints  # (runs + 1,) where its values begin
-    values: Floats  # derivatives of the pixel's expected counts
+def _own(values: Floats) -> Floats:
+    """Without the EDGE knots around a grid along axes 1 and 2."""
+    return values[:, EDGE:-EDGE, EDGE:-EDGE]
 
 
-@inner()
-def _add_runs(levels, samples, n, scaled, runs, size):
-    """Append the runs of a sample, whose terms times its light are `scaled`; returns their number.
+def sample_psf(
+    levels: Levels, field: Floats, samples: SourceSamples, coefficients: Floats
+) -> Floats:
+    """p, p_a and p_b at every sample, shape (3, samples), per square pixel.
 
-    Knots along a come one after the other, and a knot's terms within it, so each of a level's four
-    rows of knots is one run.
+    Parameters
+    ----------
+    levels : Levels
+    field : ndarray, shape (s, terms)
+        The field's terms of every source, of which the first is 1.
+    samples : SourceSamples
+    coefficients : ndarray, shape (c,), per square pixel
+
+    Returns
+    -------
+    ndarray, shape (3, samples)
     """
-    begin, first, values = runs.begin, runs.first, runs.values
-    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
-    for level in range(_wide(levels)):
-        side, h = levels.side[level], levels.spacing[level]
-        low, terms = levels.low[level], levels.high[level] - levels.low[level]
-        i = _splines(samples.a[n] / h, side, wx, spare)
-        j = _splines(samples.b[n] / h, side, wy, spare)
-        left, right = max(0, -i), min(4, side - i)
-        if right <= left:
-            continue
-        for q in range(max(0, -j), min(4, side - j)):
-            begin[size] = levels.start[level] + ((j + q) * side + i + left) * terms
-            runs.sample[size] = n if low > 0 else -1
-            at = first[size]
-            for p in range(left, right):
-                weight = wx[p] * wy[q]
-                for t in range(terms):
-                    values[at] = weight * scaled[low + t]
-                    at += 1
-            size += 1
-            first[size] = at
-    return size
+    kinds, out = _Kinds.of(levels), np.zeros((3, samples.source.size))
+    terms = np.zeros((field.shape[1], kinds.side, kinds.side))
+    for k in kinds.narrow:
+        own, side = np.moveaxis(levels.part(k, coefficients), -1, 0), int(levels.side[k])
+        if k in kinds.varying:
+            finer = halved(side)
+            own, side = finer @ own @ finer.T, len(finer)
+        terms[levels.terms(k), kinds.inside(side), kinds.inside(side)] += own
+    splines = np.tensordot(field, terms, 1) if len(terms) > 1 else terms
+    sums = [(levels.spacing[0], splines)]
+    for k in kinds.wings:
+        sums.append((levels.spacing[k], np.moveaxis(levels.part(k, coefficients), -1, 0)))
+    for spacing, c in sums:
+        add_spline(np.pad(c, [(0,), (EDGE,), (EDGE,)]), spacing, samples, out)
+    return out
 
 
-@inner(fastmath=FAST)
-def _add_square(runs, size, weight, matrix):
-    """Add weight times the runs' outer product: of two runs once, of one with itself half.
+def psf_slope(
+    levels: Levels, field: Floats, samples: SourceSamples, flux: Floats, score: Floats
+) -> Floats:
+    """The log-likelihood's slope by all coefficients, given that by every pixel.
 
-    Runs of one sample in a level that varies are left out, see `_add_variation`.
+    Parameters
+    ----------
+    levels, field, samples
+        As for `sample_psf`.
+    flux : ndarray, shape (s,), counts
+    score : ndarray, shape (pixels,)
+
+    Returns
+    -------
+    ndarray, shape (c,)
     """
-    begin, sample, first, values = runs
-    for r in range(size):
-        for k in range(first[r], first[r + 1]):
-            line, value = matrix[begin[r] + k - first[r]], weight * values[k]
-            for other in range(r, size):
-                if sample[r] >= 0 and sample[r] == sample[other]:
-                    continue
-                share = value if other > r else 0.5 * value
-                at, length = first[other], first[other + 1] - first[other]
-                target = line[begin[other] : begin[other] + length]
-                for o in range(length):
-                    target[o] += share * values[at + o]
+    kinds, out = _Kinds.of(levels), np.zeros(levels.size())
+    values = flux[samples.source] * samples.size * np.repeat(score, np.diff(samples.first))
+    every = np.arange(values.size)
+
+    def sums(spacing: float, side: int, sources: int) -> Floats:
+        room = np.zeros((sources, _padded(side), _padded(side), 1))
+        add_values(spacing, samples, (0, every), values[:, None], room)
+        return _own(room)[..., 0]
+
+    fine = np.tensordot(field.T, sums(levels.spacing[0], kinds.side, len(field)), 1)
+    for k in kinds.narrow:
+        own = kinds.on_level(k, fine[levels.terms(k)])
+        levels.part(k, out)[:] = np.moveaxis(own, 0, -1)
+    for k in kinds.wings:
+        levels.part(k, out)[..., 0] = sums(levels.spacing[k], int(levels.side[k]), 1)[0]
+    return out
 
 
-@inner(fastmath=FAST)
-def _add_columns(runs, size, columns, target):
-    """Add to the columns of target, at the runs' rows, the runs times a pixel's numbers."""
-    begin, first, values = runs.begin, runs.first, runs.values
-    for r in range(size):
-        for k in range(first[r], first[r + 1]):
-            line, value = target[begin[r] + k - first[r]], values[k]
-            for m in range(columns.size):
-                line[m] += value * columns[m]
+class _Weighed(NamedTuple):
+    """The samples and what they weigh."""
+
+    samples: SourceSamples
+    owner: Ints  # (samples,) their pixels
+    light: Floats  # (samples,)
+    weight: Floats  # (samples,) of their pixels
+    field: Floats  # (s, terms)
+
+    def batches(self, numbers: int) -> Iterator[tuple[slice, tuple[int, Ints]]]:
+        """Sources and their samples, as many together as have room with so many numbers each."""
+        source, together, size = self.samples.source, max(1, ROOM // numbers), len(self.field)
+        order = np.argsort(source, kind="stable")
+        ends = np.searchsorted(source[order], np.arange(size + 1))
+        for begin in range(0, size, together):
+            end = min(begin + together, size)
+            yield slice(begin, end), (begin, order[ends[begin] : ends[end]])
 
 
-@inner(fastmath=FAST)
-def _add_row(runs, size, factor, target):
-    """Add to target, at the runs' places, the runs times a factor."""
-    begin, first, values = runs.begin, runs.first, runs.values
-    for r in range(size):
-        at, length = first[r], first[r + 1] - first[r]
-        own = target[begin[r] : begin[r] + length]
-        for o in range(length):
-            own[o] += factor * values[at + o]
-
-
-@inner()
-def _by_source(samples, sources):
-    """The samples of every source one after the other, and where each source's begin."""
-    first = np.zeros(sources + 1, np.int64)
-    for s in samples.source:
-        first[s + 1] += 1
-    first = np.cumsum(first)
-    order, at = np.empty(samples.source.size, np.int64), first[:-1].copy()
-    for n in range(order.size):
-        s = samples.source[n]
-        order[at[s]] = n
-        at[s] += 1
-    return order, first
-
-
-@inner(fastmath=FAST)
-def _add_gram(samples, n, grid, weight, gram):
-    """Add weight times the outer product of the B-splines at a sample, of knots of one grid.
-
-    `gram` has a row for every knot, of the knots up to three rows and columns on.
-    """
-    side, h = grid
-    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
-    i = _splines(samples.a[n] / h, side, wx, spare)
-    j = _splines(samples.b[n] / h, side, wy, spare)
-    left, right, bottom = max(0, -i), min(4, side - i), min(4, side - j)
-    for q in range(max(0, -j), bottom):
-        for p in range(left, right):
-            line = gram[(j + q) * side + i + p]
-            own = weight * wx[p] * wy[q]
-            line[NEAR // 2] += 0.5 * own * wx[p] * wy[q]
-            for o in range(p + 1, right):
-                line[NEAR // 2 + o - p] += own * wx[o] * wy[q]
-            for r in range(q + 1, bottom):
-                for o in range(left, right):
-                    line[(r - q) * NEAR + NEAR // 2 + o - p] += own * wx[o] * wy[r]
-
-
-@inner(fastmath=FAST)
-def _add_line(factor, line, target):
-    """Add to target a line times a factor."""
-    for o in range(line.size):
-        target[o] += factor * line[o]
-
-
-@inner()
-def _add_squares(lines, matrix):
-    """Add half the products of lines with themselves."""
-    products = np.dot(lines.T, lines)
-    for i in range(products.shape[0]):
-        _add_line(0.5, products[i], matrix[i])
-
-
-@inner()
-def _add_wings(levels, samples, flux, i, out):
-    """Add the B-splines of pixel i in the level of wings, times the light; all knots' values."""
-    level = _wide(levels)
-    side, h = levels.side[level], levels.spacing[level]
-    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
-    for n in range(samples.first[i], samples.first[i + 1]):
-        light = flux[samples.source[n]] * samples.size[n]
-        column = _splines(samples.a[n] / h, side, wx, spare)
-        row = _splines(samples.b[n] / h, side, wy, spare)
-        for q in range(max(0, -row), min(4, side - row)):
-            for p in range(max(0, -column), min(4, side - column)):
-                out[(row + q) * side + column + p] += light * wx[p] * wy[q]
-
-
-@inner()
-def _add_variation(levels, field, samples, flux, weight, matrix):
-    """Add what the level that varies over the field shares with itself, sample by sample.
-
-    And with the wings. Within a source the terms of the field are constant, so its samples make one
-    matrix of knots, which is multiplied by the terms' products; those of many sources at once are a
-    matrix product.
-    """
-    side, h, start = levels.side[1], levels.spacing[1], levels.start[1]
-    low, high = levels.low[1], levels.high[1]
-    terms, sources, knots = high - low, field.shape[0], side * side
-    owner = np.empty(samples.source.size, np.int64)
-    for i in range(weight.size):
-        owner[samples.first[i] : samples.first[i + 1]] = i
-    order, first = _by_source(samples, sources)
-    wings = matrix.shape[0] - levels.start[2] if levels.side.size > 2 else 0
-    total, wide = np.zeros((knots * 4 * NEAR, terms * terms)), np.zeros((terms, knots * wings))
-    grams, products = np.empty((TOGETHER, knots, 4 * NEAR)), np.empty((TOGETHER, terms * terms))
-    crosses, line = np.empty((TOGETHER, knots, wings)), np.empty(wings)
-    wx, wy, spare = np.empty(4), np.empty(4), np.empty(4)
-    for begin in range(0, sources, TOGETHER):
-        some = min(TOGETHER, sources - begin)
-        grams[:some], crosses[:some] = 0.0, 0.0
-        for m in range(some):
-            s = begin + m
-            for n in order[first[s] : first[s + 1]]:
-                light = flux[s] * samples.size[n]
-                _add_gram(samples, n, (side, h), weight[owner[n]] * light**2, grams[m])
-                if wings == 0:
-                    continue
-                i = _splines(samples.a[n] / h, side, wx, spare)
-                j = _splines(samples.b[n] / h, side, wy, spare)
-                if i <= -4 or j <= -4 or i >= side or j >= side:
-                    continue
-                line[:] = 0.0
-                _add_wings(levels, samples, flux, owner[n], line)
-                for q in range(max(0, -j), min(4, side - j)):
-                    for p in range(max(0, -i), min(4, side - i)):
-                        share = weight[owner[n]] * light * wx[p] * wy[q]
-                        _add_line(share, line, crosses[m, (j + q) * side + i + p])
-            for t in range(terms):
-                for o in range(terms):
-                    products[m, t * terms + o] = field[s, low + t] * field[s, low + o]
-        total += np.dot(grams.reshape(TOGETHER, -1)[:some].T, products[:some])
-        own = np.ascontiguousarray(field[begin : begin + some, low:high].T)
-        if wings > 0:
-            wide += np.dot(own, crosses.reshape(TOGETHER, -1)[:some])
-    for knot in range(knots):
-        for o in range(4 * NEAR):
-            i, j = knot % side + o % NEAR - NEAR // 2, knot // side + o // NEAR
-            if 0 <= i < side and j < side:
-                row, column = start + knot * terms, start + (j * side + i) * terms
-                both = total[knot * 4 * NEAR + o]
-                for t in range(terms):
-                    squares = both[t * terms : (t + 1) * terms]
-                    _add_line(1.0, squares, matrix[row + t, column : column + terms])
-        for t in range(terms):
-            own = wide[t, knot * wings : (knot + 1) * wings]
-            _add_line(1.0, own, matrix[start + knot * terms + t, matrix.shape[0] - wings :])
-
-
-@inner()
-def _room(levels, samples, pixels):
-    """Runs with room for those of any pixel."""
-    crowd, width = 1, 0
-    for i in range(pixels):
-        crowd = max(crowd, samples.first[i + 1] - samples.first[i])
-    for level in range(levels.side.size):
-        width += KNOTS * (levels.high[level] - levels.low[level])
-    most = crowd * 4 * levels.side.size
-    return _Runs(
-        np.empty(most, np.int64), np.empty(most, np.int64), np.zeros(most + 1, np.int64),
-        np.empty(crowd * width),
-    )  # fmt: skip
-
-
-@inner()
-def _runs_of(grids, samples, flux, i, runs, scaled):
-    """Fill the runs of pixel i, given levels and field; returns their number."""
-    (levels, field), size = grids, 0
-    for n in range(samples.first[i], samples.first[i + 1]):
-        s = samples.source[n]
-        for t in range(scaled.size):
-            scaled[t] = flux[s] * samples.size[n] * field[s, t]
-        size = _add_runs(levels, samples, n, scaled, runs, size)
-    return size
-
-
-@inner()
-def _add_outer(runs, size, weight, line, begin, matrix):
-    """Add weight times the outer product of the runs of levels that do not vary with a line."""
-    for r in range(size):
-        if runs.sample[r] < 0:
-            for k in range(runs.first[r], runs.first[r + 1]):
-                share = weight * runs.values[k]
-                _add_line(share, line, matrix[runs.begin[r] + k - runs.first[r], begin:])
-
-
-@entry()
-def psf_information(levels, field, samples, pixels, templates):
+def psf_information(
+    levels: Levels,
+    field: Floats,
+    samples: SourceSamples,
+    pixels: tuple[Floats, Floats, Floats],
+    templates: Floats,
+) -> tuple[Floats, Floats, Floats]:
     """The information about all coefficients, beside the templates and the background's terms.
 
-    `pixels` are the flux of every source, and of every pixel the weight and the background's terms;
-    `templates` has shape (3, samples). Returns the matrix of the coefficients, shape (c, c), of
-    which the sum with its transpose is the information; the couplings with the templates, shape (3
-    sources, c); and with the background's terms, shape (c, terms).
+    Parameters
+    ----------
+    levels, field, samples
+        As for `sample_psf`.
+    pixels : tuple of ndarray
+        The flux of every source, and of every pixel the weight and the background's terms.
+    templates : ndarray, shape (3, samples)
+
+    Returns
+    -------
+    matrix : ndarray, shape (c, c)
+        Its sum with its transpose is the information.
+    coupling : ndarray, shape (3 s, c)
+        With the templates.
+    others : ndarray, shape (c, terms)
+        With the background's terms.
     """
     flux, weight, background = pixels
-    last, wide = levels.side.size - 1, _wide(levels)
-    total = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
-    matrix, others = np.zeros((total, total)), np.zeros((total, background.shape[1]))
-    coupling = np.zeros((TEMPLATES * flux.size, total))
-    runs, scaled = _room(levels, samples, weight.size), np.empty(field.shape[1])
-    begin = levels.start[wide] if wide <= last else total
-    lines, filled = np.zeros((LINES, total - begin)), 0
-    for i in range(weight.size):
-        w = weight[i]
-        if w == 0.0:
-            continue
-        size = _runs_of((levels, field), samples, flux, i, runs, scaled)
-        _add_square(runs, size, w, matrix)
-        _add_columns(runs, size, w * background[i], others)
-        for n in range(samples.first[i], samples.first[i + 1]):
-            for m in range(TEMPLATES):
-                target = coupling[TEMPLATES * samples.source[n] + m]
-                _add_row(runs, size, w * templates[m, n], target)
-        if wide <= last and samples.first[i + 1] > samples.first[i]:
-            line = lines[filled]
-            line[:] = 0.0
-            _add_wings(levels, samples, flux, i, line)
-            _add_outer(runs, size, w, line, begin, matrix)
-            for m in range(background.shape[1]):
-                _add_line(w * background[i, m], line, others[begin:, m])
-            for n in range(samples.first[i], samples.first[i + 1]):
-                for m in range(TEMPLATES):
-                    target = coupling[TEMPLATES * samples.source[n] + m]
-                    _add_line(w * templates[m, n], line, target[begin:])
-            line *= math.sqrt(w)
-            filled += 1
-            if filled == LINES:
-                _add_squares(lines, matrix[begin:, begin:])
-                filled = 0
-    _add_squares(lines[:filled], matrix[begin:, begin:])
-    if levels.high[-1 if wide > last else -2] > 1:
-        _add_variation(levels, field, samples, flux, weight, matrix)
-    return matrix, coupling, others
+    kinds, size = _Kinds.of(levels), levels.size()
+    owner = np.repeat(np.arange(weight.size), np.diff(samples.first))
+    light = flux[samples.source] * samples.size
+    weighed = _Weighed(samples, owner, light, weight[owner], field)
+    matrix, coupling = np.zeros((size, size)), np.zeros((TEMPLATES * flux.size, size))
+    others = np.zeros((background.shape[1], size))
+    columns = np.concatenate([templates, background.T[:, owner]]).T * weighed.weight[:, None]
+    _add_narrow(kinds, weighed, matrix)
+    _add_columns(kinds, weighed, columns, coupling, others)
+    if kinds.wings:
+        _add_wings(kinds, weighed, columns, matrix, coupling, others)
+    if np.diff(samples.first).max(initial=0) > 1:
+        narrow = Levels._make(each[kinds.narrow] for each in levels)
+        add_pairs((narrow, field), samples, (light, weight), templates, matrix, coupling)
+    return matrix, coupling, others.T
 
 
-@entry()
-def psf_slope(levels, field, samples, flux, score):
-    """The log-likelihood's slope by all coefficients, shape (c,), given that by every pixel."""
-    last, wide = levels.side.size - 1, _wide(levels)
-    total = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
-    out, runs = np.zeros(total), _room(levels, samples, score.size)
-    scaled, begin = np.empty(field.shape[1]), levels.start[wide] if wide <= last else total
-    line = np.empty(total - begin)
-    for i in range(score.size):
-        size = _runs_of((levels, field), samples, flux, i, runs, scaled)
-        _add_row(runs, size, score[i], out)
-        if wide <= last and samples.first[i + 1] > samples.first[i]:
-            line[:] = 0.0
-            _add_wings(levels, samples, flux, i, line)
-            _add_line(score[i], line, out[begin:])
-    return out
+def _grams(weighed: _Weighed, grid: tuple[float, int], factors: Floats) -> Floats:
+    """The sum of all sources' products of splines times factors.
+
+    Shape (side, side, ROWS, NEAR, factors), see `add_squares`.
+    """
+    spacing, side = grid
+    out = np.zeros((side * side * ROWS * NEAR, factors.shape[1]))
+    squares = weighed.weight * weighed.light**2
+    for some, order in weighed.batches(len(out)):
+        each = np.zeros((some.stop - some.start, _padded(side), _padded(side), ROWS, NEAR))
+        add_squares(spacing, weighed.samples, order, squares, each)
+        out += _own(each).reshape(len(each), -1).T @ factors[some]
+    return out.reshape(side, side, ROWS, NEAR, -1)
+
+
+def _fill(grams: Floats, block: Floats) -> None:
+    """Write products of splines, shape (side, side, ROWS, NEAR, terms, terms), into a block."""
+    n = len(grams)
+    target = np.moveaxis(block, 2, 4)  # (side, side, side, side, terms, terms)
+    for row in range(min(ROWS, n)):
+        for column in range(-(NEAR // 2), NEAR // 2 + 1):
+            j, i = np.arange(n - row)[:, None], np.arange(max(0, -column), n - max(0, column))
+            target[j, i, j + row, i + column] = grams[j, i, row, column + NEAR // 2]
+
+
+def _add_narrow(kinds: _Kinds, weighed: _Weighed, matrix: Floats) -> None:
+    """Add what the levels but the wings share."""
+    levels = kinds.levels
+    side, field, first = kinds.side, weighed.field, kinds.inside(int(levels.side[0]))
+    fine = _grams(weighed, (levels.spacing[0], side), field)
+    _fill(fine[first, first, :, :, :1, None], levels.block(0, 0, matrix))
+    for k in kinds.varying:
+        terms, cross = levels.terms(k), levels.block(0, k, matrix)
+        for t in range(terms.start, terms.stop):
+            half = np.zeros((side, side, 1, side, side, 1))
+            _fill(fine[..., t, None, None], half)
+            square = half.reshape(side * side, -1)
+            both = (square + square.T).reshape((side,) * 4)[first, first]
+            cross[:, :, 0, :, :, t - terms.start] = kinds.on_level(k, both)
+        row, column = np.triu_indices(terms.stop - terms.start)
+        own = field[:, terms]
+        grams = _grams(
+            weighed, (levels.spacing[k], int(levels.side[k])), own[:, row] * own[:, column]
+        )
+        every = np.empty((*grams.shape[:-1], *(terms.stop - terms.start,) * 2))
+        every[..., row, column] = every[..., column, row] = grams
+        _fill(every, levels.block(k, k, matrix))
+
+
+def _add_columns(
+    kinds: _Kinds,
+    weighed: _Weighed,
+    columns: Floats,
+    coupling: Floats,
+    others: Floats,
+) -> None:
+    """Add what the levels but the wings share with the templates and the background's terms.
+
+    `columns` are the weighed ones of both at every sample, the templates of its own source.
+    """
+    levels = kinds.levels
+    values = columns * weighed.light[:, None]
+    samples, side = weighed.samples, _padded(kinds.side)
+    for some, order in weighed.batches(side**2 * values.shape[1]):
+        sums = np.zeros((some.stop - some.start, side, side, values.shape[1]))
+        add_values(levels.spacing[0], samples, order, values, sums)
+        sums = np.ascontiguousarray(np.moveaxis(_own(sums), -1, 1))
+        rows = coupling[TEMPLATES * some.start : TEMPLATES * some.stop]
+        for k in kinds.narrow:
+            own, terms = kinds.on_level(k, sums), weighed.field[some, levels.terms(k)]
+            levels.part(k, others)[:] += np.tensordot(own[:, TEMPLATES:], terms, (0, 0))
+            own = own[:, :TEMPLATES].reshape(len(rows), -1, 1)
+            np.matmul(
+                own,
+                np.repeat(terms, TEMPLATES, 0)[:, None],
+                rows[:, levels.where(k)].reshape(*own.shape[:2], -1),
+            )
+
+
+def _add_wings(
+    kinds: _Kinds,
+    weighed: _Weighed,
+    columns: Floats,
+    matrix: Floats,
+    coupling: Floats,
+    others: Floats,
+) -> None:
+    """Add what the level of wings shares, with all samples of a pixel together."""
+    levels, k, samples, field = kinds.levels, kinds.wings[0], weighed.samples, weighed.field
+    side, wide = _padded(kinds.side), _padded(int(levels.side[k]))
+    light = levels.spacing[k], weighed.owner, weighed.light
+    squares = weighed.light * weighed.weight
+    crosses = np.zeros((field.shape[1], side**2 * wide**2))
+    for some, order in weighed.batches(crosses.shape[1]):
+        each = np.zeros((some.stop - some.start, side, side, wide, wide))
+        add_crosses(levels.spacing[0], samples, order, squares, light, each)
+        crosses += field[some].T @ each.reshape(len(each), -1)
+    own = (slice(EDGE, -EDGE),) * 4
+    shared = np.moveaxis(crosses.reshape(-1, side, side, wide, wide)[:, *own], [1, 2], [3, 4])
+    for narrow in kinds.narrow:
+        coarse = kinds.on_level(narrow, shared[levels.terms(narrow)])
+        levels.block(narrow, k, matrix)[..., 0] = np.moveaxis(coarse, [3, 4, 0], [0, 1, 2])
+    every = 0, np.arange(samples.source.size)
+    both = np.zeros((1, wide, wide, wide, wide))
+    add_crosses(levels.spacing[k], samples, every, squares, light, both)
+    levels.block(k, k, matrix)[:, :, 0, :, :, 0] = 0.5 * both[0][own]
+    lit = np.zeros((len(field), TEMPLATES, wide, wide))
+    add_light(samples, light, columns, lit)
+    rows = levels.part(k, coupling)[..., 0]
+    rows[:] = lit[..., *own[:2]].reshape(rows.shape)
+    sums = np.zeros((1, wide, wide, columns.shape[1]))
+    add_values(levels.spacing[k], samples, every, columns * weighed.light[:, None], sums)
+    levels.part(k, others)[..., 0] = np.moveaxis(_own(sums)[0, :, :, TEMPLATES:], -1, 0)
