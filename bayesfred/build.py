@@ -100,6 +100,10 @@ def priors_given(run: settings.RunSettings | JointRun) -> dict[str, Any]:
 
 def maps_given(run: settings.RunSettings, run_file: Path) -> PixelMaps:
     """The maps of pixels that [frame] names."""
+    if run.frame.gain is not None and run.frame.gain_map is not None:
+        raise InputError(
+            f"{run_file}: frame.gain_map: got it with gain, expected one of the two: leave one out"
+        )
     named = run.frame.maps.items()
     return read_maps({name: resolve(path, run_file, must_exist=True) for name, path in named})
 

@@ -203,10 +203,12 @@ def main() -> int:
     def exp() -> object:
         return np.exp(x, out=out)
 
-    def read_noise(value: object) -> Callable[[], object]:
-        noise = bf.PoissonNoise(value)
+    def with_noise(noise: object) -> Callable[[], object]:
         noisy = bf.Posterior(m, bf.simulate(m, THETA, 5.0, seed=1, noise=noise), noise=noise)
         return with_threads(1, lambda: noisy.log_prob(truth))
+
+    pixels, side = np.random.default_rng(1), m.detector.shape
+    flat_fielded = bf.FlatFieldNoise(bf.PoissonNoise(), pixels.uniform(0.5, 1.5, side))
 
     # the same sources in four times the empty frame, their pixels within the smaller one too
     inner, outer = (
@@ -260,14 +262,15 @@ def main() -> int:
         ),
         *(
             (
-                f"log-posterior, read noise {name} / none",
-                ratio(read_noise(value), with_threads(1, lambda: posterior.log_prob(truth)), 40),
+                f"log-posterior, {name} / photon noise",
+                ratio(with_noise(noise), with_threads(1, lambda: posterior.log_prob(truth)), 40),
                 1.5,
             )
-            for name, value in (
-                ("0.5", 0.5),
-                ("2", 2.0),
-                ("of a map", np.random.default_rng(1).uniform(1.0, 3.0, m.detector.shape)),
+            for name, noise in (
+                ("read noise 0.5", bf.PoissonNoise(0.5)),
+                ("read noise 2", bf.PoissonNoise(2.0)),
+                ("a map of read noises", bf.PoissonNoise(pixels.uniform(1.0, 3.0, side))),
+                ("a flat field", flat_fielded),
             )
         ),
         (

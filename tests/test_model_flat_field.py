@@ -295,13 +295,13 @@ def test_run_file_with_maps(folder: Path) -> None:
     output = invoke(folder, "fit", "run.toml", "--map-only")
     assert output.code == 0
     assert "flat by flat.fits, 3 pixels masked; variance by variance.fits" in output.stdout
-    posterior = open_chain(folder / "run.h5").posterior()
+    posterior = open_chain(folder / "chains" / "run.h5").posterior()
     assert isinstance(posterior, bf.Posterior)
     assert posterior.noise == bf.FlatFieldNoise(
         bf.PoissonNoise(READ_NOISES["map"]), np.where(posterior.mask, FLAT, 1.0)
     )
     assert np.flatnonzero(~posterior.mask).tolist() == [229, 230, 231]
-    assert all(check.passed for check in verify(folder / "run.h5"))
+    assert all(check.holds for check in verify(folder / "chains" / "run.h5"))
     # an input is never replaced
     (folder / "run.toml").write_text(RUN + '[output]\npath = "flat.fits"\n')
     assert invoke(folder, "fit", "run.toml", "--map-only", "--overwrite").code == 2
@@ -313,7 +313,7 @@ def test_run_file_with_maps(folder: Path) -> None:
     ("old", "new", "line"),
     [
         ('"flat.fits"', '"none.fits"', "got 'none.fits', expected a file at"),
-        ('"flat.fits"', '"variance.fits"', "variance.fits: flat: got a median of 4"),
+        ('"flat.fits"', '"variance.fits"', "variance.fits: flat: got a median of [34]"),
         ('"flat.fits"', '"small.fits"', r"variance.fits: variance: got shape .* expected \(3, 4"),
         ('"flat.fits"', '"dead.fits"', "dead.fits: flat: got no such pixel, expected numbers from"),
         ('"flat.fits"', "3", "frame.flat: got 3, expected"),

@@ -61,12 +61,6 @@ class FrameSettings(Section):
         given = {"gain": self.gain_map, "flat": self.flat, "variance": self.variance}
         return {name: path for name, path in given.items() if path is not None}
 
-    @model_validator(mode="after")
-    def _one_gain(self) -> FrameSettings:
-        if self.gain is not None and self.gain_map is not None:
-            raise ValueError("gain_map: got it with gain, expected one of the two: leave one out")
-        return self
-
 
 class TargetSettings(Section):
     """`[catalogue.grid]`: a target that is indexed from the frame; `optimize.grid_target` does it.
