@@ -331,7 +331,7 @@ def main() -> int:
     Console(width=None if sys.stdout.isatty() else 110).print(table)
     met = all(bound is None or value <= bound for _, value, bound in rows)
     if "--full" in sys.argv[1:]:  # programs of their own, for their memory's sake
-        for name in ("peers", "large", "joint", "first_use"):
+        for name in ("peers", "large", "joint", "first_use", "report"):
             sys.stdout.flush()
             met &= (
                 subprocess.run([sys.executable, "-m", f"benchmarks.{name}"], check=False).returncode

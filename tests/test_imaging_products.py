@@ -3,9 +3,11 @@
 import numpy as np
 import oracles
 import pytest
+from numba import types
 from numpy.typing import NDArray
 
 import bayesfred as bf
+from bayesfred.imaging.kernels.products import _product_lines
 
 Floats = NDArray[np.float64]
 
@@ -88,3 +90,12 @@ def test_derivatives_are_those_of_the_general_loops(
         one.likelihood.own_pixels(x, 3.0)[0], other.likelihood.own_pixels(y, 3.0)[0], strict=True
     ):
         assert np.asarray(mine) == pytest.approx(np.asarray(others), rel=1e-7, abs=1e-7)
+
+
+def test_what_makes_products_is_compiled_only_for_them() -> None:
+    """For no frame whose maps are more than translations, and for those that are (a control)."""
+    for posterior in pair(DETECTORS["impulse"], NUISANCES["scale"]):
+        posterior.fisher(at(posterior))
+    kinds = [dict(zip(s[0].fields, s[0].types, strict=True)) for s in _product_lines.overloads]
+    optics = [dict(zip(k["optics"].fields, k["optics"].types, strict=True)) for k in kinds]
+    assert optics and all(o["translates"] == types.boolean for o in optics)
