@@ -31,7 +31,7 @@ from bayesfred.optimize.psf_equations import WIDTH, PsfEquations, PsfState, fiel
 from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
 from bayesfred.optimize.psf_samples import PsfSamples
 
-KNOTS_PER_WIDTH = 6.0  # at the least: a spline follows any PSF so to 1e-4 of its peak
+FULLY_SAMPLED = 1.5  # pixel: PSFs of a larger FWHM have fewer knots per pixel
 TURNS = 40
 CHOOSING = 8  # turns in which the counts choose the strengths of the prior
 EXACT = 4  # turns in which the model is taken to be exact
@@ -188,7 +188,7 @@ def starting_state(
     sigma = float(estimate.params[names.index(WIDTH)]) if WIDTH in names else psf.sigma
     pixel = 0.0 if has_pixel(psf) or posterior.model.detector.pixel == "impulse" else 1.0
     width = math.hypot(sigma, pixel / math.sqrt(12.0))
-    knots = max(1.0, min(oversampling, oversampling * KNOTS_PER_WIDTH / (4.0 * FWHM * width)))
+    knots = max(1.0, min(oversampling, oversampling * FULLY_SAMPLED / (FWHM * width)))
     radius = min(RADIUS * width, max(NARROWEST * width, _reach(posterior, estimate.params)))
     grid = PsfGrid(knots, width, degree, radius)
     side = int(grid.levels.side[0])

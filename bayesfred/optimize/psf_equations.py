@@ -35,6 +35,7 @@ from bayesfred.optimize.psf_samples import (
 OUTLYING = 6.0  # standard deviations beyond which a pixel counts less
 TOGETHER = 512  # rows of a matrix
 PROBES = 40  # draws from which the number of determined coefficients is estimated
+SEEN = 0.1  # of a source's light that its flux and place are found by, at the least
 FASTEST = 30.0  # factor by which a strength may change in a turn
 SCATTER, WIDTH = "position_scatter", "psf_sigma"
 HELD = (SCATTER, WIDTH, "model_error")  # parameters that are not solved for here
@@ -132,6 +133,8 @@ class PsfInformation:
         free = np.zeros((len(state.fluxes), 3), bool)
         free[:, 0] = posterior.nuisances.flux == "free"
         free[:, 1:] = posterior.nuisances.position_scatter
+        light = np.bincount(data.samples.source, pixels.templates[0], len(free))
+        free[light < SEEN] = False  # wings alone would make of noise any flux
         which = np.flatnonzero(free.ravel() & (own.diagonal() > 0.0))
         if not which.size:
             none = np.zeros((0, len(joint)))
