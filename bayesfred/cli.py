@@ -264,7 +264,7 @@ def compare(
     """Rank models of one frame by how well they predict sources that are left out."""
     run(
         lambda: bf.show.show_comparison(
-            bf.commands.compare(chain_files, out=out, overwrite=overwrite)
+            bf.commands.compare(chain_files, out=out, overwrite=overwrite, say=print)
         )
     )
 

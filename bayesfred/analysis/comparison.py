@@ -12,7 +12,9 @@ Z the evidence, the integral of likelihood times prior. Z(F, R) is that of the c
 sampling, and Z(R) that of a fit without the fold, by importance sampling from its own proposal
 (`evidence`). Free fluxes and shifts of the sources are integrated out of the likelihoods, those of
 the sources in F too. What a prior is multiplied with cancels. A source that several frames show is
-left out of all of them (`joint_folds`).
+left out of all of them (`joint_folds`). A PSF that was measured on the frame is measured again
+without the sources that are left out (`left_out`); then there is no evidence, and there is the
+share of the sources' variety that a model explains.
 
 A model is scored by elpd, the sum over folds, and differences are judged by the scatter of the
 folds' differences. The weights of stacking are those of the mixture of all models that predicts the
@@ -29,7 +31,7 @@ T. Sivula, M. Magnusson, A. Vehtari (2020), arXiv:2008.10296: what a difference 
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +54,10 @@ from bayesfred.analysis.joint_folds import (
     frame_views,
     require_visible,
 )
+from bayesfred.analysis.left_out import LeftOut, Weights, leave_out, measured_here
+from bayesfred.analysis.ranking import Comparison, Score, error_of_sum
 from bayesfred.errors import InputError
+from bayesfred.model.posterior import Posterior
 from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.newton import maximize
@@ -69,109 +74,6 @@ NEGLIGIBLE = 4.0
 STANDARD_ERRORS = 2.0
 
 OPTIMAL = 1e-6  # of the mean predictive density, relative
-
-
-@dataclass(frozen=True)
-class Score:
-    """How well one model predicts sources that it has not seen.
-
-    Attributes
-    ----------
-    name : str
-    n_parameters : int
-        Free numbers: parameters, and every source's flux and shifts where these are free.
-    elpd, elpd_se : float
-        Expected log predictive density of the frame, leaving out one fold of the sources at a
-        time, and its standard error.
-    difference, difference_se : float
-        The best model's elpd less this one's, and its standard error from the folds' differences;
-        0 for the best.
-    weight : float
-        In the mixture of models that predicts the folds best (stacking).
-    log_evidence, evidence_error : float
-        Logarithm of the evidence, with the standard deviation of its Monte Carlo error.
-    pareto_k : float
-        Largest shape of the weights of a fold's evidence; -inf where none has a tail, inf where
-        a few draws have all the weight of one.
-    n_unreliable : int
-        Folds whose shape exceeds 1 - 1 / log10(200): their part of elpd is not to be trusted.
-    by_fold : ndarray, shape (K,)
-        The parts of elpd.
-    """
-
-    name: str
-    n_parameters: int
-    elpd: float
-    elpd_se: float
-    difference: float
-    difference_se: float
-    weight: float
-    log_evidence: float
-    evidence_error: float
-    pareto_k: float
-    n_unreliable: int
-    by_fold: Floats = field(repr=False, compare=False)
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Models of the same frame or frames, ranked by predictive accuracy.
-
-    Attributes
-    ----------
-    scores : tuple of Score
-        The best model first.
-    chosen : str
-        The model with the fewest parameters among those that predict as well as the best: whose
-        elpd is less than 4, or less than twice the difference's standard error, below the best
-        one's. Of few folds K it is not twice, but the quantile of Student's distribution.
-    folds : tuple of tuple of int or str
-        The sources of each fold, as numbered in the catalogue from 0; of several frames with the
-        frame's name, such as `a.3`.
-    extra : mapping of (str, str) to ExtraParameters
-        By the names of a leaner and a larger model that contains it, whether the parameters that
-        only the larger one has are real.
-    """
-
-    scores: tuple[Score, ...]
-    chosen: str
-    folds: tuple[tuple[int | str, ...], ...]
-    extra: Mapping[tuple[str, str], ExtraParameters]
-
-    @property
-    def reliable(self) -> bool:
-        """Whether every fold's evidence can be trusted."""
-        return not any(score.n_unreliable for score in self.scores)
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What was chosen, which parameters are real, and which sources decide."""
-        return (
-            f"chosen: {self.chosen}, the one with the fewest parameters that predicts sources as "
-            "well as the best",
-            *(self._extra_said(*pair) for pair in self.extra if self.chosen in pair),
-            self._decisive(),
-        )
-
-    def _extra_said(self, leaner: str, larger: str) -> str:
-        found = self.extra[leaner, larger]
-        gain, error = _difference(self._score(larger), self._score(leaner))
-        doubt = ", but uncertain to predict better" if self.chosen == leaner else ""
-        what = f"real{doubt}" if found.real else "not seen"
-        return (
-            f"{larger} beside {leaner}: what it adds is {what} ({found}); gain in prediction "
-            f"{gain:.1f} +- {error:.1f}"
-        )
-
-    def _decisive(self) -> str:
-        best, second = self.scores[:2]
-        gain = best.by_fold - second.by_fold
-        first = np.argsort(-np.abs(gain), kind="stable")[:3]
-        parts = (f"{', '.join(map(str, self.folds[k]))} ({gain[k]:+.1f})" for k in first)
-        return f"sources that decide most between the first two: {'; '.join(parts)}"
-
-    def _score(self, name: str) -> Score:
-        return next(score for score in self.scores if score.name == name)
 
 
 class _Fitted(NamedTuple):
@@ -233,6 +135,9 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
             f"chains: got {len(chains)}, expected at least two models of one frame to compare"
         )
     posteriors = comparable_posteriors(chains)
+    if any(map(measured_here, posteriors.values())):
+        with one_blas_thread():
+            return _with_psfs_measured_again(chains, posteriors)
     for name, chain in chains.items():
         require_sampled(name, chain)
     with one_blas_thread():
@@ -244,6 +149,46 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
             name: _left_out(chain, posteriors[name], evidence[name], folds)
             for name, chain in chains.items()
         }
+    return _ranked(fitted, folds)
+
+
+def _with_psfs_measured_again(
+    chains: Mapping[str, Chain], posteriors: Mapping[str, AnyPosterior]
+) -> Comparison:
+    """Compare models of one frame of which some have a PSF that was measured on it."""
+    single = {name: own for name, own in posteriors.items() if isinstance(own, Posterior)}
+    likely = max(single, key=lambda name: chains[name].estimate.log_prob)
+    folds = fold_frames(single[likely], chains[likely].estimate.params, FOLDS)
+    require_visible(folds, FEWEST, "to predict some from the others")
+    leanest = min(single, key=lambda name: _count_free(single[name]))
+    weights = Weights.of(single[leanest], chains[leanest].estimate.params)
+    found, fitted = dict[str, LeftOut](), dict[str, _Fitted]()
+    for name, own in single.items():
+        estimate, random = chains[name].estimate, random_numbers(chains[name])
+        left = found[name] = leave_out(own, estimate, folds.frames[""], weights, random)
+        none = np.zeros((left.log_density.size, 0))
+        shapes = np.full(left.log_density.size, -np.inf)
+        evidence = Evidence(math.nan, math.nan)
+        fitted[name] = _Fitted(
+            chains[name], own, evidence, left.log_density, left.error, shapes, none, none
+        )
+    ranked = _ranked(fitted, folds)
+    most = max((left.misfit for left in found.values()), key=np.sum)
+    share = {name: _explained(most, left.misfit) for name, left in found.items()}
+    scores = [replace(s, explained=share[s.name][0], explained_se=share[s.name][1])
+              for s in ranked.scores]  # fmt: skip
+    return replace(ranked, scores=tuple(scores))
+
+
+def _explained(before: Floats, after: Floats) -> tuple[float, float]:
+    """The share of a misfit that is gone, and its error; nan where there was none to be seen."""
+    if before.sum() < STANDARD_ERRORS * error_of_sum(before):
+        return math.nan, math.nan
+    share = 1.0 - float(after.sum() / before.sum())
+    return share, error_of_sum(after - (1.0 - share) * before) / float(before.sum())
+
+
+def _ranked(fitted: Mapping[str, _Fitted], folds: FrameFolds) -> Comparison:
     weights = _stacking(np.array([fit.by_fold for fit in fitted.values()]).T)
     scores = _scores(fitted, dict(zip(fitted, weights, strict=True)))
     factor = stats.t.isf(stats.norm.sf(STANDARD_ERRORS), len(scores[0].by_fold) - 1)
@@ -288,13 +233,13 @@ def _scores(fitted: Mapping[str, _Fitted], weights: Mapping[str, float]) -> tupl
     for name in ranked:
         fit = fitted[name]
         behind = best.by_fold - fit.by_fold
-        error = 0.0 if fit is best else math.hypot(_error_of_sum(behind), best.error, fit.error)
+        error = 0.0 if fit is best else math.hypot(error_of_sum(behind), best.error, fit.error)
         scores.append(
             Score(
                 name,
                 _count_free(fit.posterior),
                 float(fit.by_fold.sum()),
-                math.hypot(_error_of_sum(fit.by_fold), fit.error),
+                math.hypot(error_of_sum(fit.by_fold), fit.error),
                 float(behind.sum()),
                 error,
                 float(weights[name]),
@@ -308,19 +253,11 @@ def _scores(fitted: Mapping[str, _Fitted], weights: Mapping[str, float]) -> tupl
 
 
 def _count_free(posterior: AnyPosterior) -> int:
-    """Parameters, and every source's flux and shifts where these are free."""
+    """Parameters, every source's flux and shifts where these are free, and a measured PSF's."""
     frames = [view.posterior for view in frame_views(posterior)]
     profiled = sum(frame.nuisances.profiled * len(frame.model.sources) for frame in frames)
-    return posterior.n_parameters + profiled
-
-
-def _error_of_sum(values: Floats) -> float:
-    return float(np.sqrt(values.size * np.var(values, ddof=1)))
-
-
-def _difference(one: Score, other: Score) -> tuple[float, float]:
-    gain = one.by_fold - other.by_fold
-    return float(gain.sum()), _error_of_sum(gain)
+    measured = sum(f.psf_errors.absorbed for f in frames if f.psf_errors is not None)
+    return posterior.n_parameters + profiled + round(measured)
 
 
 def _stacking(log_density: Floats) -> Floats:
@@ -349,7 +286,7 @@ def _extra(fitted: Mapping[str, _Fitted]) -> dict[tuple[str, str], ExtraParamete
     for leaner, one in fitted.items():
         for larger, other in fitted.items():
             values = contained(one.posterior, one.chain.estimate.params, other.posterior)
-            if values is None:
+            if values is None or not one.change.size:
                 continue
             names = other.posterior.parameter_names
             added = [k for k, name in enumerate(names) if name not in one.posterior.parameter_names]

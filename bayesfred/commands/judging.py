@@ -26,6 +26,7 @@ from bayesfred.reporting.comparison import ComparedRun, write_comparison
 from bayesfred.reporting.studies import calibration_plot, noise_plot
 from bayesfred.reporting.style import png
 from bayesfred.sampling.chainfile import open_chain
+from bayesfred.sampling.progress import working
 from bayesfred.sampling.sampler import versions
 from bayesfred.settings.joint import JointRun, read_run
 from bayesfred.settings.simulation import StudySettings
@@ -160,7 +161,11 @@ def verify(chain_file: PathLike, *, every_draw: bool = False) -> verification.Ve
 
 
 def compare(
-    chain_files: Sequence[PathLike], *, out: PathLike | None = None, overwrite: bool = False
+    chain_files: Sequence[PathLike],
+    *,
+    out: PathLike | None = None,
+    overwrite: bool = False,
+    say: Say | None = None,
 ) -> Compared:
     """Rank models of one frame by how well they predict sources, and show runs side by side.
 
@@ -172,6 +177,8 @@ def compare(
         A page to write, .html. It is written of runs that cannot be ranked, too.
     overwrite : bool
         Replace the page.
+    say : callable, optional
+        Without it no progress is shown.
 
     Returns
     -------
@@ -195,7 +202,8 @@ def compare(
     chains = {str(name): open_chain(name) for name in names}
     ranking, reason = None, ""
     try:
-        ranking = comparison.compare(chains)
+        with working("predicting sources that are left out", show=say is not None):
+            ranking = comparison.compare(chains)
     except InputError as error:
         if page is None or len(chains) < 2:
             raise

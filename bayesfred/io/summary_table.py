@@ -7,7 +7,7 @@ import numpy as np
 from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
-__all__ = ["Table", "make_table"]
+__all__ = ["Table", "make_table", "vstack"]
 
 
 def make_table(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Table:

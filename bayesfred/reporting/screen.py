@@ -15,6 +15,7 @@ from bayesfred.analysis.comparison import Comparison
 from bayesfred.analysis.cross_check import CrossCheck
 from bayesfred.analysis.noise_study import VARIABLES, NoiseStudy
 from bayesfred.analysis.photons import rounded
+from bayesfred.analysis.ranking import Score
 from bayesfred.analysis.sbc import SBCResult
 from bayesfred.analysis.verify import Check
 from bayesfred.errors import printable
@@ -217,9 +218,7 @@ def comparison_table(compared: Comparison, width: int) -> Table:
                 ["", *(f"{s.difference:.1f} +- {s.difference_se:.1f}" for s in scores[1:])],
             ),
             _Column("weight", [f"{s.weight:.2f}" for s in scores], 2),
-            _Column(
-                "log evidence", [f"{s.log_evidence:.1f} +- {s.evidence_error:.2f}" for s in scores]
-            ),
+            *_evidence(scores),
             _Column(
                 "Pareto k",
                 [f"{s.pareto_k:.2f}" if s.pareto_k > -np.inf else "" for s in scores],
@@ -228,6 +227,14 @@ def comparison_table(compared: Comparison, width: int) -> Table:
         ],
         width,
     )
+
+
+def _evidence(scores: Sequence[Score]) -> list[_Column]:
+    """No column where PSFs were measured on the frame, which leaves the evidence unknown."""
+    if any(math.isnan(s.log_evidence) for s in scores):
+        return []
+    cells = [f"{s.log_evidence:.1f} +- {s.evidence_error:.2f}" for s in scores]
+    return [_Column("log evidence", cells)]
 
 
 def cross_check_table(found: CrossCheck, width: int) -> Table:
