@@ -38,7 +38,8 @@ def frame_given(
     Returns
     -------
     counts : ndarray, shape (ny, nx), counts
-        nan in pixels that the frame itself masks.
+        nan in pixels that the frame itself masks. That of a file mapped into memory is not
+        copied, if it has whole numbers or float64.
     mask : ndarray of bool, shape (ny, nx), or None
         True where a pixel is to be used, by `mask` and by the frame.
 
@@ -52,6 +53,10 @@ def frame_given(
     >>> frame_given(np.ma.masked_equal([[3.0, -1.0]], -1.0))
     (array([[ 3., nan]]), array([[ True, False]]))
     """
+    if isinstance(counts, np.memmap) and (counts.dtype.kind in "ui" or counts.dtype == np.float64):
+        # read where it is needed: a large frame would not fit the memory once more; arithmetic with
+        # numbers of these types is that of float64, which float32 would not be
+        return np.asarray(counts), None if mask is None else np.array(mask, dtype=bool)
     if getattr(counts, "flags", None) is not None and hasattr(counts, "uncertainty"):
         raise InputError("counts: got a frame with flags, expected a mask: set mask, not flags")
     factor = _electrons(getattr(counts, "unit", None))

@@ -10,21 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Optics, stride
+from bayesfred.imaging.kernels.contexts import Basis, Optics, stride
 from bayesfred.imaging.kernels.render import render as render_sources
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.contexts import (
-    LIMIT,
-    MASKED,
-    Frame,
     Parameters,
     Problem,
     Rendered,
@@ -38,7 +35,7 @@ from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
 from bayesfred.model.kernels.sources import OwnPixels, own_pixels
-from bayesfred.model.noise import ModelErrorNoise, Noise, model_error_terms
+from bayesfred.model.noise import ModelErrorNoise, Noise
 from bayesfred.model.parameters import (
     BACKGROUND_TERMS,
     SCALES,
@@ -47,10 +44,19 @@ from bayesfred.model.parameters import (
     Parameter,
     displacing,
 )
-from bayesfred.model.pixels import polynomial_background
+from bayesfred.model.pixels import padded_frame, polynomial_background
 from bayesfred.model.threads import share
 
 BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
+BLOCK = 2**21  # pixels of a large frame that are looked at together
+
+
+class Expected(NamedTuple):
+    """Expected counts; NaN where a map folds."""
+
+    light: Floats  # (ny, nx) of the sources, counts per pixel
+    level: Floats  # (ny, nx) of the background
+    fluxes: Floats  # (s,) counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,11 +169,22 @@ class FrameLikelihood:
 
     def expected_counts(self, params: Floats) -> Floats:
         """Expected counts: see `Posterior.expected_counts`."""
-        return self._expected(params)[0]
+        with self.expected(params) as found:
+            return found.light + found.level
 
     def fluxes(self, params: Floats) -> Floats:
         """Flux of every source, counts: see `Posterior.fluxes`."""
-        return self._expected(params)[1]
+        with self.expected(params) as found:
+            return found.fluxes
+
+    @contextmanager
+    def expected(self, params: Floats) -> Iterator["Expected"]:
+        """Expected counts in the memory where they are rendered, which then serves others again."""
+        ny, nx = self.model.detector.shape
+        with self._rendered(params) as (w, rendered, parameters):
+            bad = 0.0 if rendered.extra > -np.inf else np.nan
+            level = polynomial_background(self.mask.shape, parameters.background + bad)
+            yield Expected(w.image.reshape(ny, -1)[:, :nx], level, rendered.fluxes + bad)
 
     def own_pixels(self, params: Floats, radius: float) -> tuple[OwnPixels, Floats, Floats, Floats]:
         """The sources' own pixels and templates, and the model that these belong to.
@@ -254,14 +271,6 @@ class FrameLikelihood:
         slope = polynomial_background(self.mask.shape, level) - level[0]
         return ModelErrorNoise(self.noise, nuisances.model_error, slope)
 
-    def _expected(self, params: Floats) -> tuple[Floats, Floats]:
-        ny, nx = self.model.detector.shape
-        with self._rendered(params) as (w, rendered, parameters):
-            sources = w.image.reshape(ny, -1)[:, :nx].copy()
-        level = polynomial_background(self.mask.shape, parameters.background)
-        bad = 0.0 if rendered.extra > -np.inf else np.nan
-        return sources + level + bad, rendered.fluxes + bad
-
     def image_positions(self, params: Floats) -> Floats:
         """Where the sources are imaged, shape (s, 2), fine pixel; nan without an image."""
         theta, offset = displacing(self.parameters, params)
@@ -270,7 +279,7 @@ class FrameLikelihood:
 
     def background(self, params: Floats) -> Floats:
         """The background polynomial at every pixel, shape (ny, nx), counts per pixel."""
-        return polynomial_background(self.mask.shape, self._one(params).background)
+        return polynomial_background(self.mask.shape, self._one(params).background).copy()
 
     def _arguments(self, vectors: Floats) -> Vectors:
         """Distortion coefficients, source nuisances and background coefficients, a row a vector."""
@@ -362,7 +371,9 @@ class FrameLikelihood:
 
     @cached_property
     def _faint(self) -> Flags:
-        """Sources of fewer than `BRIGHT` standard deviations, by the catalogue and the frame."""
+        """Free fluxes of fewer than `BRIGHT` standard deviations, by catalogue and frame."""
+        if not self._free:
+            return np.zeros(self._flux.size, bool)
         counts = np.maximum(self.counts, 0.0)
         with np.errstate(all="ignore"):  # at a mean of zero
             variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
@@ -372,29 +383,16 @@ class FrameLikelihood:
     @cached_property
     def _problem(self) -> Problem:
         shape = self.nuisances.flux_shape
-        return Problem(self._optics, self._frame, self._flux, shape, self._faint, self._free)
-
-    @cached_property
-    def _frame(self) -> Frame:
-        ny, nx = self.model.detector.shape
-        values = np.full((ny, stride(nx)), MASKED)
-        values[:, :nx] = np.where(self.mask, self.counts, MASKED)
-        used = (values > LIMIT).reshape(-1, SEGMENT)
-        total = np.where(used, values.reshape(-1, SEGMENT), 0.0).sum(axis=1)
-        noise = base = self.noise.terms(values)
-        if self.nuisances.model_error:
-            noise = model_error_terms(self.noise, values, self.counts, self.mask)
-        varies = self.nuisances.background_order > 0
-        return Frame(
-            values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
-            float(total.sum()), ny, nx, noise, varies,
-            everywhere=varies or not hasattr(base, "unreached"),
-        )  # fmt: skip
+        frame = padded_frame(self.counts, self.mask, self.noise, self.nuisances)
+        return Problem(self._optics, frame, self._flux, shape, self._faint, self._free)
 
     @cached_property
     def _constant(self) -> float:
         """The part of the log-likelihood that depends on the counts alone."""
-        return self.noise.constant(self.counts, self.mask)
+        ny, nx = self.mask.shape
+        rows = max(1, BLOCK // nx)
+        some = [slice(first, first + rows) for first in range(0, ny, rows)]
+        return sum(self.noise.at(s).constant(self.counts[s], self.mask[s]) for s in some)
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

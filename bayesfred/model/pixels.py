@@ -8,8 +8,10 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.kernels.contexts import SEGMENT, stride
 from bayesfred.io.memory import require_room
-from bayesfred.model.noise import Noise
+from bayesfred.model.kernels.contexts import LIMIT, MASKED, Frame
+from bayesfred.model.noise import Noise, model_error_terms
 from bayesfred.model.parameters import BACKGROUND_POWERS, Nuisances
 
 OVERLAP = 12.0  # PSF widths beyond which sources have nothing to do with one another
@@ -113,11 +115,31 @@ def footprints(detector: Detector, positions: Floats, radius: float) -> Flags:
     return inside
 
 
+def padded_frame(counts: Floats, mask: Flags, noise: Noise, nuisances: Nuisances) -> Frame:
+    """The counts as the compiled loops need them; `mask` says which pixels are used."""
+    ny, nx = counts.shape
+    values = np.full((ny, stride(nx)), MASKED)
+    np.copyto(values[:, :nx], counts, where=mask)
+    used = (values > LIMIT).reshape(-1, SEGMENT)
+    total = values.reshape(-1, SEGMENT).sum(axis=1, where=used)
+    terms = base = noise.terms(values)
+    if nuisances.model_error:
+        terms = model_error_terms(noise, values, counts, mask)
+    varies = nuisances.background_order > 0
+    return Frame(
+        values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
+        float(total.sum()), ny, nx, terms, varies,
+        everywhere=varies or not hasattr(base, "unreached"),
+    )  # fmt: skip
+
+
 def polynomial_background(shape: tuple[int, ...], coefficients: Floats) -> Floats:
-    """The background polynomial, shape (ny, nx), counts per pixel."""
-    u, v = (np.arange(1 - n, n, 2) / n for n in shape[::-1])
-    out = np.zeros(shape)
-    for (m, n), value in zip(BACKGROUND_POWERS, coefficients, strict=True):
+    """The background polynomial, shape (ny, nx), counts per pixel, not to be written to."""
+    out = np.broadcast_to(coefficients[0], shape)
+    if not np.any(coefficients[1:]):
+        return out
+    out, (u, v) = out.copy(), (np.arange(1 - n, n, 2) / n for n in shape[::-1])
+    for (m, n), value in zip(BACKGROUND_POWERS[1:], coefficients[1:], strict=True):
         if value:
             out += value * u**m * v[:, None] ** n
     return out

@@ -38,7 +38,8 @@ class Posterior(FrameDensity):
     model : ForwardModel
     counts : array_like, MaskedArray, Quantity, NDData or CCDData, shape (ny, nx), counts
         Masked pixels are not used. A unit has to be electrons, photons or counts; uncertainties
-        have to be those of the noise model.
+        have to be those of the noise model. A `numpy.memmap` of whole numbers or float64 is not
+        copied: its file must stay as it is.
     prior : mapping of str to frozen scipy.stats distribution, optional
         By parameter name; the others get the default of the table of parameters. Parameters are
         independent a priori. A distortion that leaves a source without an image, or folds the frame
@@ -59,6 +60,7 @@ class Posterior(FrameDensity):
     Attributes
     ----------
     counts : ndarray, shape (ny, nx), counts; 0 where not finite
+        Whole numbers where these are mapped from a file, else float64.
     mask : ndarray of bool, shape (ny, nx)
         Pixels in the likelihood: those asked for, within the footprint.
 
@@ -106,15 +108,19 @@ class Posterior(FrameDensity):
     ) -> None:
         frame, mask = frame_given(counts, mask, getattr(noise, "variance", None))
         used = usable_pixels(model, frame, mask, noise, nuisances)
+        finite = np.isfinite(frame)
         if valid is None:
-            valid = np.isfinite(frame) & (True if mask is None else mask)
+            valid = finite & (True if mask is None else mask)
+        valid = used if np.array_equal(valid, used) else np.array(valid, dtype=bool)
         if extrapolation is not None and extrapolation.model is not model:
             raise InputError(
                 "extrapolation: got that of another model, expected this one's: leave it out"
             )
+        if not finite.all():
+            frame = np.where(finite, frame, 0.0)
         self._set_fields(
-            model, np.where(np.isfinite(frame), frame, 0.0), {}, noise, used, nuisances,
-            extrapolation, np.array(valid, dtype=bool), psf_errors,
+            model, frame, {}, noise, used, nuisances,
+            extrapolation, valid, psf_errors,
         )  # fmt: skip
         object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
         if psf_errors is not None:

@@ -23,14 +23,12 @@ def require_light(posterior: Posterior) -> None:
     ------
     InputError
     """
-    counts = posterior.counts[posterior.mask]
-    low, high = float(counts.min()), float(counts.max())
-    if (low == high and counts.size > 1) or (
-        isinstance(posterior.noise, PoissonNoise) and high < 1
-    ):
+    counts, used, number = posterior.counts, posterior.mask, int(posterior.mask.sum())
+    low, high = float(counts[used].min()), float(counts[used].max())
+    if (low == high and number > 1) or (isinstance(posterior.noise, PoissonNoise) and high < 1):
         got = f"{high:g} in each" if low == high else f"at most {high:.2g}"
         raise InputError(
-            f"counts: got {got} of {counts.size} pixels, expected images of the sources: such a "
+            f"counts: got {got} of {number} pixels, expected images of the sources: such a "
             "frame holds no information: check the exposure and the gain"
         )
 

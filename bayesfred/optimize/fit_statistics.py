@@ -29,15 +29,18 @@ fit.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from bayesfred._typing import Floats
+from bayesfred.model.likelihood import Expected
+from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 
 BLOCK = 2**16  # pixels
+PART = 2**21  # pixels of a frame that are gathered at once
 
 # The model fits where deviance and Pearson's statistic are within this many standard deviations of
 # their expectations.
@@ -46,48 +49,66 @@ CONSISTENT = 5.0
 
 def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     """The numbers that judge a fit, by the names that `Diagnostics` gives them."""
-    used = posterior.mask
-    n = posterior.counts[used]
-    mu = posterior.expected_counts(params)[used]
     level = float(params[posterior.parameter_names.index("background")])
     background = level if posterior.nuisances.background_order == 0 else math.nan
-    residual = n - (mu - background)
-    estimate = float(np.mean(residual))
     profiled = posterior.nuisances.profiled * posterior.model.sources.flux.size
     fitted = posterior.n_parameters + profiled
     if posterior.psf_errors is not None:
         fitted += round(posterior.psf_errors.absorbed)
-    noise, sums = posterior.noise_at(params).at(used), np.zeros(7)
-    with np.errstate(all="ignore"):  # a mean of zero makes a statistic infinite, which is its value
-        # whole frames of intermediate numbers would not fit the caches, or the memory
-        for first in range(0, n.size, BLOCK):
-            block = slice(first, first + BLOCK)
-            some, here, own = n[block], mu[block], noise.at(block)
-            parts = (
-                own.residual(some, here, level) ** 2,
-                own.pearson_variance(here, level),
-                own.deviance(some, here, level),
-                *own.deviance_moments(here, level),
-                own.fisher_weight(here, level),
-            )
-            sums += [np.sum(part) for part in parts]
+    noise, sums, moments = posterior.noise_at(params), np.zeros(7), np.zeros(3)
+    # a mean of zero makes a statistic infinite, which is its value
+    with posterior.likelihood.expected(params) as expected, np.errstate(all="ignore"):
+        for n, mu, own in _parts(posterior, expected, noise):
+            residual = n - (mu - background)
+            moments += n.size, np.sum(residual), 0.0
+            # frames of intermediate numbers would not fit the caches
+            for first in range(0, n.size, BLOCK):
+                block = slice(first, first + BLOCK)
+                sums += _sums(own.at(block), n[block], mu[block], level)
+        number, estimate = int(moments[0]), float(moments[1] / moments[0])
+        for n, mu, _ in _parts(posterior, expected, noise):
+            moments[2] += np.sum((n - (mu - background) - estimate) ** 2)
         pearson, pearson_variance, deviance, mean, variance, slope, inverse = sums.tolist()
         # a fitted background removes the part that is linear in the counts: see the head of the
         # module
         left = variance - slope**2 / np.float64(inverse)
-    scaled = float(np.mean((residual - estimate) ** 2) / estimate) if estimate > 0.0 else math.nan
+    scaled = float(moments[2] / number / estimate) if estimate > 0.0 else math.nan
     return {
-        "n_pixels": n.size,
+        "n_pixels": number,
         "n_fitted": fitted,
         "background_estimate": estimate,
         "chi2_paper": scaled,
         "pearson": pearson,
-        "pearson_expected": float(n.size - fitted),
+        "pearson_expected": float(number - fitted),
         "pearson_sd": math.sqrt(pearson_variance),
         "deviance": deviance,
         "deviance_expected": mean - fitted,
         "deviance_sd": float(np.sqrt(left)),
     }
+
+
+def _parts(
+    posterior: Posterior, expected: Expected, noise: Noise
+) -> Iterator[tuple[Floats, Floats, Noise]]:
+    """Counts, their means and the noise of the pixels in use, some rows at a time."""
+    ny, nx = posterior.mask.shape
+    rows = max(1, PART // nx)
+    for first in range(0, ny, rows):
+        some = slice(first, first + rows)
+        used = posterior.mask[some]
+        mu = (expected.light[some] + expected.level[some])[used]
+        yield np.asarray(posterior.counts[some][used], np.float64), mu, noise.at(some).at(used)
+
+
+def _sums(noise: Noise, n: Floats, mu: Floats, level: float) -> Floats:
+    parts = (
+        noise.residual(n, mu, level) ** 2,
+        noise.pearson_variance(mu, level),
+        noise.deviance(n, mu, level),
+        *noise.deviance_moments(mu, level),
+        noise.fisher_weight(mu, level),
+    )
+    return np.array([np.sum(part) for part in parts])
 
 
 def misfit(fit: Mapping[str, float], name: str = "deviance") -> float:

@@ -75,7 +75,9 @@ def _part(posterior: Posterior, sources: Flags, pixels: Flags, width: float) -> 
     flux = posterior.nuisances.flux
     return Posterior(
         replace(model, sources=few, psf=GaussianPSF(width) if blur > 0 else model.psf),
-        ndimage.gaussian_filter(posterior.counts, blur) if blur > 0 else posterior.counts,
+        ndimage.gaussian_filter(posterior.counts, blur, output=np.float64)
+        if blur > 0
+        else posterior.counts,
         prior={name: prior for name, prior in posterior.prior.items() if name not in SCALES},
         noise=posterior.noise,
         mask=pixels,

@@ -18,6 +18,7 @@ References
 G. L. Turin (1960), IRE Transactions on Information Theory 6, 311: matched filters.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,19 +103,23 @@ def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     s = float(np.hypot(known.get("psf_sigma", model.psf.sigma) / step, 12.0**-0.5))
     position = field.predict(params[field.columns]) / step
     place = (position + 0.5 * (np.array(detector.shape[::-1]) - 1.0))[:, ::-1]
-    expected = posterior.expected_counts(params)
-    residual = np.where(posterior.mask, posterior.counts - expected, 0.0)
-    variance = posterior.noise_at(params).counts_variance(expected, known["background"])
-    variance = np.where(posterior.mask, variance, 0.0)
-
-    sums = np.zeros((5, len(position)))
+    noise_at, sums = posterior.noise_at(params), np.zeros((5, len(position)))
     reach = np.arange(-int(np.ceil(3.0 * s)), int(np.ceil(3.0 * s)) + 1)
     several = max(1, BLOCK // reach.size**2)
-    for first in range(0, len(position), several):
-        some = slice(first, first + several)
-        sums[:, some] = _filtered(place[some], reach, s, residual, variance, posterior.mask)
+    with posterior.likelihood.expected(params) as expected:
+
+        def gathered(here: tuple[Ints, Ints]) -> tuple[Floats, Floats]:
+            mean, used = expected.light[here] + expected.level[here], posterior.mask[here]
+            variance = noise_at.at(here).counts_variance(mean, known["background"])
+            residual = np.where(used, posterior.counts[here] - mean, 0.0)
+            return residual, np.where(used, variance, 0.0)
+
+        for first in range(0, len(position), several):
+            some = slice(first, first + several)
+            sums[:, some] = _filtered(place[some], reach, s, gathered, posterior.mask)
+        fluxes = expected.fluxes
     light, along_u, along_v, noise, covered = sums
-    own = np.maximum(posterior.fluxes(params), 0.0) * covered
+    own = np.maximum(fluxes, 0.0) * covered
     light = light + own
     noise = np.sqrt(np.maximum(noise, 1e-300))
     covered = 4.0 * np.pi * s**2 * covered
@@ -156,9 +161,15 @@ def enough_matched(posterior: Posterior, light: SourceLight) -> bool:
 
 
 def _filtered(
-    place: Floats, reach: Ints, s: float, residual: Floats, variance: Floats, mask: Flags
+    place: Floats,
+    reach: Ints,
+    s: float,
+    gathered: Callable[[tuple[Ints, Ints]], tuple[Floats, Floats]],
+    mask: Flags,
 ) -> Floats:
     """Sums over the pixels around some images, weighted with the filter G, shape (5, n).
+
+    `gathered` returns the residual and its variance in the pixels that an index selects.
 
     Of G r, G r times the offsets along u and v, G^2 V, and G^2 over the pixels in use.
     """
@@ -170,7 +181,7 @@ def _filtered(
     g_v *= (row >= 0) & (row < ny)
     g_u *= ((column >= 0) & (column < nx)) / (2.0 * np.pi * s**2)
     here = np.clip(row, 0, ny - 1)[:, :, None], np.clip(column, 0, nx - 1)[:, None]
-    r, squares = residual[here], (g_v**2, g_u**2)
+    (r, variance), squares = gathered(here), (g_v**2, g_u**2)
 
     def total(image: Floats, along: tuple[Floats, Floats]) -> Floats:
         return np.asarray(np.einsum("nvu,nv,nu->n", image, *along, optimize=True))
@@ -180,7 +191,7 @@ def _filtered(
             total(r, (g_v, g_u)),
             total(r, (g_v, g_u * off_u)),
             total(r, (g_v * off_v, g_u)),
-            total(variance[here], squares),
+            total(variance, squares),
             total(mask[here].astype(float), squares),
         ]
     )

@@ -6,6 +6,7 @@ from scipy import ndimage
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.posterior import Posterior
 
+PART = 2**21  # pixels of a large frame that are filtered at once
 SIGNIFICANCE = 4.0  # of a peak, in standard deviations of the filtered frame
 
 
@@ -28,27 +29,68 @@ def find_peaks(posterior: Posterior) -> Floats:
     s = max(np.sqrt(width**2 + (block**2 - 1) / 12.0) / block, 1.0)
     ny, nx = (n // block for n in detector.shape)
 
-    def binned(frame: Floats) -> Floats:
+    frame = _Binned(posterior, block, (ny, nx))
+    # Large frames are filtered in bands of rows, with as many beside them as the filters reach.
+    rows, margin = max(1, PART // (nx * block**2)), int(4.0 * s + 0.5) + 2
+    level = frame.level(rows)
+    places, heights = [np.empty((0, 2))], [np.empty(0)]
+    for first in range(0, ny, rows):
+        top, last = max(first - margin, 0), min(first + rows + margin, ny)
+        counts, each, used = frame.filled(slice(top, last), level)
+        variance = ndimage.gaussian_filter(each, s) / (2.0 * np.pi * s**6)
+        filtered = -ndimage.gaussian_laplace(counts, s)
+        peak = filtered == ndimage.maximum_filter(filtered, 3)
+        peak &= filtered > SIGNIFICANCE * np.sqrt(variance)
+        peak &= used > 0.5 * block**2
+        peak[[0, -1]] = peak[:, [0, -1]] = False
+        peak[: first - top], peak[first - top + rows :] = False, False
+        j, i = np.nonzero(peak)
+        places.append(vertex(filtered, j, i) + np.array([top, 0.0]))
+        heights.append(filtered[j, i])
+    order = np.argsort(-np.concatenate(heights))[: 3 * len(posterior.model.sources)]
+    # from a block's index to the frame's middle, in fine pixels
+    positions = block * (np.concatenate(places)[order] + 0.5) - 0.5 * np.array(detector.shape)
+    return np.asarray(positions[:, ::-1] * step)
+
+
+class _Binned:
+    """A frame in blocks of pixels, of which some rows are needed at a time."""
+
+    def __init__(self, posterior: Posterior, block: int, shape: tuple[int, int]) -> None:
+        self.posterior, self.block, self.shape = posterior, block, shape
+
+    def _sums(self, pixels: Floats | Flags) -> Floats:
+        nx, block = self.shape[1], self.block
         return np.asarray(
-            frame[: ny * block, : nx * block].reshape(ny, block, nx, block).sum(axis=(1, 3))
+            pixels[:, : nx * block].reshape(-1, block, nx, block).sum(axis=(1, 3), dtype=np.float64)
         )
 
-    used = binned(posterior.mask.astype(np.float64))
-    total = binned(np.where(posterior.mask, posterior.counts, 0.0))
-    level = float(np.median(total[used > 0] / used[used > 0])) if used.any() else 0.0
-    filled = np.where(posterior.mask, posterior.counts, level)
-    each = posterior.noise.counts_variance(np.maximum(filled, 1e-9), max(level, 1e-9))
-    variance = ndimage.gaussian_filter(binned(each), s) / (2.0 * np.pi * s**6)
-    filtered = -ndimage.gaussian_laplace(binned(filled), s)
-    peak = filtered == ndimage.maximum_filter(filtered, 3)
-    peak &= filtered > SIGNIFICANCE * np.sqrt(variance)
-    peak &= used > 0.5 * block**2
-    peak[[0, -1]] = peak[:, [0, -1]] = False
-    j, i = np.nonzero(peak)
-    order = np.argsort(-filtered[j, i])[: 3 * len(posterior.model.sources)]
-    # from a block's index to the frame's middle, in fine pixels
-    positions = block * (vertex(filtered, j, i)[order] + 0.5) - 0.5 * np.array(detector.shape)
-    return np.asarray(positions[:, ::-1] * step)
+    def level(self, rows: int) -> float:
+        """The median of the blocks' means."""
+        means, size = np.empty(self.shape[0] * self.shape[1]), 0
+        for first in range(0, self.shape[0], rows):
+            last = min(first + rows, self.shape[0])
+            pixels = slice(first * self.block, last * self.block)
+            mask = self.posterior.mask[pixels]
+            used = self._sums(mask)
+            total = self._sums(np.where(mask, self.posterior.counts[pixels], 0.0))
+            some = total[used > 0] / used[used > 0]
+            means[size : size + some.size] = some
+            size += some.size
+        return float(np.median(means[:size], overwrite_input=True)) if size else 0.0
+
+    def filled(self, rows: slice, level: float) -> tuple[Floats, Floats, Floats]:
+        """Counts of rows of blocks, their variance, and how many of the pixels are in use.
+
+        Others count as at the level.
+        """
+        posterior = self.posterior
+        pixels = slice(rows.start * self.block, rows.stop * self.block)
+        mask = posterior.mask[pixels]
+        counts = np.where(mask, posterior.counts[pixels], level)
+        noise = posterior.noise.at(pixels)
+        each = noise.counts_variance(np.maximum(counts, 1e-9), max(level, 1e-9))
+        return self._sums(counts), self._sums(each), self._sums(mask)
 
 
 def typical_flux(counts: Floats, mask: Flags, width: float, number: int) -> float:

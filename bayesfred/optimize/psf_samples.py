@@ -79,7 +79,9 @@ class PsfSamples:
         powers = [BACKGROUND_POWERS[slot] for slot in free]
         s_u, s_v = (numbers % nx - middle[0]) * 2 / nx, (numbers // nx - middle[1]) * 2 / ny
         terms = np.stack([s_u**m * s_v**n for m, n in powers], axis=1)
-        return cls(samples, numbers, owner, posterior.counts.ravel()[numbers], terms)
+        return cls(
+            samples, numbers, owner, posterior.counts.ravel()[numbers].astype(np.float64), terms
+        )
 
     def residual(
         self, posterior: Posterior, params: Floats, light: Floats

@@ -184,10 +184,11 @@ def _sum_up(frame, w, parameters, visit, fluxes):
                 place[i] = used + fp.start[i] - fp.start[p]
             used += fp.start[q] - fp.start[p]
             add_source(layout, s, (p, q), fluxes[s], visit.canvas, visit.templates)
+        rows = parameters.background, (top, last)
         if expanded:
-            weigh_rows(frame, noise, w, parameters.background, (top, last), w.ratio)
+            weigh_rows(frame, noise, w, rows, w.weight, w.ratio)
         else:
-            weigh_rows(frame, noise, w, parameters.background, (top, last), None)
+            weigh_rows(frame, noise, w, rows, w.weight, None)
         _multiply_band(w, visit, top, last)
 
 

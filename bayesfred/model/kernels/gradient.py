@@ -258,11 +258,11 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
 
 
 @inner()
-def _ratios(profiled, w):
-    """Where the ratios of the workspace are wanted; None where fluxes are fixed."""
+def _wanted(profiled, w):
+    """Where weights and ratios of the workspace are wanted; None where fluxes are fixed."""
     if profiled is None:
-        return None
-    return w.ratio
+        return None, None
+    return w.weight, w.ratio
 
 
 def _no_responses(noise, frame, w, background):
@@ -386,8 +386,8 @@ def gradient(problem, w, rendered, parameters, basis, out):
         return (math.nan, math.nan), np.empty((0, 0))
     fp, pitch = rendered.footprints, w.image.size // o.ny
     layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
-    ratios = _ratios(rendered.profiled, w)
-    weigh_rows(frame, noise, w, background, (0, o.ny), ratios)
+    wanted = _wanted(rendered.profiled, w)
+    weigh_rows(frame, noise, w, (background, (0, o.ny)), wanted[0], wanted[1])
     scatter = parameters.nuisances.position_scatter
     response = _responses(noise, frame, w, background)
     z, mixed, h, y, slope = _laplace_adjoint(

@@ -40,6 +40,7 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
     """Buffers for one thread.
 
     With free fluxes they hold the templates as they are without a distortion and a quarter more.
+    With fixed ones nothing needs score and weight at once, which then share their memory.
     """
     ny, pitch = o.ny, o.ramp.size
     span = np.tile(np.array([pitch, -1]), (ny, 1))
@@ -48,7 +49,8 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
         samples = count_samples(o, nuisances)
         more = size + (5 if nuisances.position_scatter == 0.0 else 15) * samples // 4
     flags = np.zeros(size // SEGMENT, np.uint8)
-    image, score, weight, ratio, heap = map(_aligned, (size, size, size, size, more))
+    image, score, heap = map(_aligned, (size, size, more))
+    weight, ratio = (score, _aligned(0)) if free is None else map(_aligned, (size, size))
     scratch = _aligned(4 * STRETCH).reshape(4, STRETCH)
     return Workspace(image, flags, span, score, weight, ratio, heap, scratch)
 
@@ -168,7 +170,8 @@ def stretch(frame, background, j, first, image):
 def weigh_run(noise, part, score, weight, ratio):
     """Score d log L/d mu and weight -d^2 log L/d mu^2 of a stretch, zero where masked.
 
-    And, unless `ratio` is None, the ratio of d^3 log L/d mu^3 to twice the weight.
+    And, unless `ratio` is None, the ratio of d^3 log L/d mu^3 to twice the weight. Without a
+    weight, which may be None, the score alone.
     """
     values, image, first = part.values, part.image, part.first
     c0, c1, c2, u, step = part.c0, part.c1, part.c2, part.u, part.step
@@ -177,17 +180,20 @@ def weigh_run(noise, part, score, weight, ratio):
         mu = image[i] + (c0 + x * (c1 + x * c2))
         counted = values[i] > LIMIT
         s, w, c = derivatives(noise, values[i] if counted else mu, mu, image[i], U(first + i))
-        score[i], weight[i] = s if counted else 0.0, w if counted else 0.0
+        score[i] = s if counted else 0.0
+        if weight is not None:
+            weight[i] = w if counted else 0.0
         if ratio is not None:
             ratio[i] = c / w if counted and w > LEAST else 0.0
 
 
 @shared()
-def weigh_rows(frame, noise, w, background, rows, ratios):
-    """Score and weight of the marked pixels of rows (first, last + 1).
+def weigh_rows(frame, noise, w, place, weights, ratios):
+    """Score of the marked pixels of rows (first, last + 1), with the background there: `place`.
 
-    And their ratios, unless `ratios` is None.
+    And their weights and ratios, each unless it is None.
     """
+    background, rows = place
     pitch = frame.values.size // frame.ny
     for j in range(rows[0], rows[1]):
         start, stop = next_run(w, j, w.span[j, 0])
@@ -195,7 +201,8 @@ def weigh_rows(frame, noise, w, background, rows, ratios):
             a, b = j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT
             part = stretch(frame, background, j, a, w.image[a:b])
             ratio = None if ratios is None else ratios[a:b]
-            weigh_run(noise, part, w.score[a:b], w.weight[a:b], ratio)
+            weight = None if weights is None else weights[a:b]
+            weigh_run(noise, part, w.score[a:b], weight, ratio)
             start, stop = next_run(w, j, stop)
 
 
