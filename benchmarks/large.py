@@ -82,7 +82,7 @@ def kernel_share(posterior: bf.Posterior, params: np.ndarray) -> float:
     times = np.empty((5, 2))
     for row in times:
         start = time.thread_time()
-        with posterior._rendered(params[None]):
+        with posterior.likelihood.expected(params):
             pass
         middle = time.thread_time()
         posterior.log_prob(params)
@@ -103,9 +103,7 @@ def main() -> int:
     split.watch(bf.Posterior, "gradient", "gradients")
     split.watch(bf.Posterior, "fisher", "Fisher information")
     split.watch(search, "find_start", "peaks, matching")
-    split.watch(search, "goodness", "deviance at the maximum")
-    split.watch(sampler, "bulk_sizes", "checks for convergence")
-    split.watch(sampler, "effective_sizes", "checks for convergence")
+    split.watch(search, "fit_statistics", "deviance at the maximum")
     split.watch(sampler, "write_chain", "checkpoints")
     top = split.run("rest of the search", bf.find_map, posterior)
     to_map = sum(split.spent.values())
