@@ -55,7 +55,7 @@ def peak() -> float:
 
 def search(side: int, path: Path) -> None:
     """Print seconds, GiB, GiB of the process before, and 1 where the maximum was found."""
-    few, theta = problem(101)
+    few, theta = problem(512)
     small = bf.Posterior(few, bf.simulate(few, theta, 5.0, seed=1))
     bf.find_map(small)  # compiled code is loaded
     before = peak()

@@ -19,6 +19,7 @@ close calls, the search rejects what the true parameters would reject, wherever 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -149,8 +150,17 @@ class _Residuals:
         self.inside &= posterior.mask[self.row, self.column]
         self.flux = known.get("flux_scale", 1.0) * model.sources.flux
         self.height = 4.0 * np.pi * s**4  # of flux over height
+        self.near = 2 * int(np.ceil(3.0 * s)) + 1
         self.noise, self.level = posterior.noise_at(params), known["background"]
         self.expected = posterior.expected_counts(params)
+
+    @cached_property
+    def stars(self) -> Floats:
+        """The light of the stars nearby, filtered, shape (ny, nx)."""
+        return self._nearby(self.expected)
+
+    def _nearby(self, expected: Floats) -> Floats:
+        return np.asarray(ndimage.maximum_filter(self._filtered(expected), self.near))
 
     def share(self, lost: Flags) -> float:
         """Sources in the frame that are lost."""
@@ -165,18 +175,18 @@ class _Residuals:
         """Which sources are missing, shape (n,), and the pixels without detections, (ny, nx)."""
         p, s = self.posterior, self.width
         missing, expected = np.zeros(self.flux.size, bool), self.expected
-        light = np.zeros(p.counts.shape)
-        mask, near = p.mask, 2 * int(np.ceil(3.0 * s)) + 1
+        stars = self.stars if tolerance else None
+        light, mask = np.zeros(p.counts.shape), p.mask
         for _ in range(LOOKS):
             each = self.noise.counts_variance(expected + np.maximum(light, 0.0), self.level)
             variance = ndimage.gaussian_filter(np.where(p.mask, each, 0.0), s)
             limit = SIGNIFICANCE * np.sqrt(variance / (2.0 * np.pi * s**6))
             limit += SIGNIFICANCE**2 / self.height
-            if tolerance:
-                limit += tolerance * ndimage.maximum_filter(self._filtered(expected), near)
+            if stars is not None:
+                limit += tolerance * stars
             excess = self._filtered(p.counts - expected - light)
             height = np.abs(excess)
-            peak = (height > limit) & (height == ndimage.maximum_filter(height, near))
+            peak = (height > limit) & (height == ndimage.maximum_filter(height, self.near))
             row, column = np.nonzero(peak)
             if not row.size:
                 break
@@ -188,6 +198,7 @@ class _Residuals:
                 break
             if np.any(absent >= 0):
                 expected = _part(p, missing, p.mask).expected_counts(self.params)
+                stars = self._nearby(expected) if tolerance else None
             light += self._image(positions[absent < 0], flux[absent < 0])
             wider = 2 * int(np.ceil(0.25 * s)) + 1  # for detections of another width
             spread = ndimage.maximum_filter(np.abs(light), wider)

@@ -65,6 +65,7 @@ from bayesfred.model.kernels.contexts import LIMIT, Touching
 from bayesfred.model.kernels.expansion import Pixels, add_slopes, expand
 from bayesfred.model.kernels.likelihood import (
     U,
+    add_background_sums,
     background_row,
     log_likelihood,
     next_run,
@@ -335,26 +336,6 @@ def _fill_images(noise, frame, w, background, h, y):
 
 
 @inner()
-def _add_background(frame, w, image, out):
-    """Add the sum of the image times 1, u, v, u^2, uv, v^2 over the marked pixels."""
-    pitch = frame.values.size // frame.ny
-    for j in range(frame.ny):
-        v = (2 * j - frame.ny + 1) / frame.ny
-        start, stop = next_run(w, j, w.span[j, 0])
-        while start >= 0:
-            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
-                if frame.values[p] > LIMIT:
-                    u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                    out[0] += image[p]
-                    out[1] += image[p] * u
-                    out[2] += image[p] * v
-                    out[3] += image[p] * u * u
-                    out[4] += image[p] * u * v
-                    out[5] += image[p] * v * v
-            start, stop = next_run(w, j, stop)
-
-
-@inner()
 def _fill_weights(w, fp, a, s, t, out):
     """c_t of source s at every sample of its footprint."""
     flux, z, begin = a.fluxes[s], a.z[s, t], fp.start[fp.first[s]]
@@ -394,7 +375,7 @@ def gradient(problem, w, rendered, parameters, basis, out):
         w, layout, rendered, rendered.profiled, scatter, response
     )
     image, below, by_error = _images(noise, frame, w, background, h, y)
-    _add_background(frame, w, below, out[1])
+    add_background_sums(frame, w, below, out[1])
     out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]
     out[1][0] += level_derivatives(frame.noise, frame.pixels, level, value)[0]
     most = 0

@@ -214,6 +214,26 @@ def slope_run(part, out):
         out[i] = part.image[i] + x * (part.c1 + x * part.c2)
 
 
+@inner()
+def add_background_sums(frame, w, image, out):
+    """Add the sum of the image times 1, u, v, u^2, uv, v^2 over the marked pixels."""
+    pitch = frame.values.size // frame.ny
+    for j in range(frame.ny):
+        v = (2 * j - frame.ny + 1) / frame.ny
+        start, stop = next_run(w, j, w.span[j, 0])
+        while start >= 0:
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                if frame.values[p] > LIMIT:
+                    u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
+                    out[0] += image[p]
+                    out[1] += image[p] * u
+                    out[2] += image[p] * v
+                    out[3] += image[p] * u * u
+                    out[4] += image[p] * u * v
+                    out[5] += image[p] * v * v
+            start, stop = next_run(w, j, stop)
+
+
 @shared()
 def unreached_pixels(frame, w):
     """The pixels that no source reaches."""
