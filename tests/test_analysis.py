@@ -1,6 +1,8 @@
 """Convergence and sensitivity against known answers, measures of fit against simulated refits."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +22,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.model.likelihood import Expected
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.model.noise.poisson import deviance_moments
 from bayesfred.model.parameters import Nuisances
@@ -201,6 +204,11 @@ def profile() -> Floats:
 def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None = None) -> Any:
     """Stand-in for what `diagnose` reads: a source of free flux on a constant background."""
     spot = profile()
+
+    @contextmanager
+    def expected(params: Floats) -> Iterator[Expected]:
+        yield Expected(params[0] * spot, np.full(SHAPE, params[1]), params[:1])
+
     return SimpleNamespace(
         counts=counts,
         mask=np.ones(SHAPE, bool) if mask is None else mask,
@@ -212,7 +220,7 @@ def linear_posterior(counts: Floats, noise: Any, mask: NDArray[np.bool_] | None 
         model=SimpleNamespace(
             sources=SimpleNamespace(flux=np.ones(1)), polynomial=SimpleNamespace(n_terms=0)
         ),
-        expected_counts=lambda params: params[0] * spot + params[1],
+        likelihood=SimpleNamespace(expected=expected),
         psf_errors=None,
         noise_at=lambda params: noise,
         log_prior=lambda draws: np.zeros(len(draws)),

@@ -22,6 +22,7 @@ from bayesfred.imaging.kernels.render import render as render_sources
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.contexts import (
+    Frame,
     Parameters,
     Problem,
     Rendered,
@@ -178,7 +179,7 @@ class FrameLikelihood:
             return found.fluxes
 
     @contextmanager
-    def expected(self, params: Floats) -> Iterator["Expected"]:
+    def expected(self, params: Floats) -> Iterator[Expected]:
         """Expected counts in the memory where they are rendered, which then serves others again."""
         ny, nx = self.model.detector.shape
         with self._rendered(params) as (w, rendered, parameters):
@@ -250,8 +251,7 @@ class FrameLikelihood:
         at_rest = nuisances._replace(position_scatter=0.0)
         unfolded = render_sources(optics, theta, at_rest, flux, out)
         if nuisances.position_scatter:
-            # a shift is as imaged: it moves the image, and leaves the distortion that of the
-            # catalogue's position
+            # as imaged: a shift moves the image, the distortion is that of the catalogue's position
             scale = nuisances.position_scatter * np.sqrt(DOF / rng.chisquare(DOF, flux.size))
             by_x, by_y = scale * rng.standard_normal((2, flux.size))
             out[:] = 0.0
@@ -374,24 +374,26 @@ class FrameLikelihood:
         """Free fluxes of fewer than `BRIGHT` standard deviations, by catalogue and frame."""
         if not self._free:
             return np.zeros(self._flux.size, bool)
-        counts = np.maximum(self.counts, 0.0)
         with np.errstate(all="ignore"):  # at a mean of zero
+            counts = np.maximum(self.counts, 0.0)
             variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
         area = 4.0 * np.pi * (self.model.psf.sigma / self.model.detector.binning) ** 2
         return self._flux**2 < BRIGHT**2 * (self._flux + area * variance)
 
     @cached_property
     def _problem(self) -> Problem:
-        shape = self.nuisances.flux_shape
-        frame = padded_frame(self.counts, self.mask, self.noise, self.nuisances)
-        return Problem(self._optics, frame, self._flux, shape, self._faint, self._free)
+        n = self.nuisances
+        return Problem(self._optics, self._frame, self._flux, n.flux_shape, self._faint, self._free)
+
+    @cached_property
+    def _frame(self) -> Frame:
+        return padded_frame(self.counts, self.mask, self.noise, self.nuisances)
 
     @cached_property
     def _constant(self) -> float:
         """The part of the log-likelihood that depends on the counts alone."""
-        ny, nx = self.mask.shape
-        rows = max(1, BLOCK // nx)
-        some = [slice(first, first + rows) for first in range(0, ny, rows)]
+        rows = max(1, BLOCK // self.mask.shape[1])
+        some = (slice(k, k + rows) for k in range(0, len(self.mask), rows))
         return sum(self.noise.at(s).constant(self.counts[s], self.mask[s]) for s in some)
 
     def __getstate__(self) -> dict[str, Any]:
