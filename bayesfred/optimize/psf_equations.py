@@ -126,7 +126,7 @@ class PsfInformation:
         idle = np.diag(inner) <= 0.0
         inner[idle, idle] = 1.0
         size = len(half)
-        joint = np.empty((size + len(inner), size + len(inner)))
+        joint = np.zeros((size + len(inner), size + len(inner)))
         np.add(half, half.T, out=joint[:size, :size])
         joint[size:, :size] = (coupling.T @ columns + offset @ select).T
         joint[size:, size:] = inner
