@@ -310,11 +310,6 @@ def dense_log_prob(posterior: Posterior, params: Floats, order: int = 7) -> tupl
         posterior.noise, BackgroundNoise
     ):  # the squares of dark pixels are what the bright ones' leave of the total
         size = size + 0.1 * posterior.counts[posterior.mask] ** 2 / named["background"]
-    if isinstance(posterior.noise, PoissonNoise) and np.any(posterior.noise.read_noise):
-        # the table of one read noise and the formulas differ in the rounding of n^2 / 2 r^2, which
-        # a pixel's other terms nearly cancel, and of an exponential of 1e-14
-        read_noise = np.broadcast_to(posterior.noise.read_noise, posterior.mask.shape)
-        size = size + 0.1 * (posterior.counts / read_noise)[posterior.mask] ** 2
     prior = [
         float(distribution.logpdf(x))
         for distribution, x in zip(posterior.prior.values(), params, strict=True)

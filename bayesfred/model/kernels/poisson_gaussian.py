@@ -224,19 +224,21 @@ def tilted_mean(mu, s):
 
 @inner(fastmath=FAST, forceinline=True)
 def improved(n, mu, variance, s, y, q):
-    """log p without log phi from rough s, y and q, and s, y and q to 1e-8.
+    """log p without log phi from rough s, y and q, and s, y and q to 1e-11.
 
     log p is stationary in s, so that the change of s counts by its square.
     """
     total, tilt = y + variance, variance * s
     q = q * (2.0 - total * q)
+    q = q * (2.0 - total * q)
     less = y + tilt - n
-    change = less * q
-    term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + change * (y * q) * (1.0 / 6.0))
-    change *= 1.0 + 0.5 * change * (y * q)
-    less = y * change * (1.0 - change * (0.5 - change * (1.0 / 6.0)))
+    change, rho = less * q, y * q
+    third = change * rho * (1.0 / 6.0 + change * (0.125 * rho - 1.0 / 24.0))
+    term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + third)
+    change *= 1.0 + change * rho * (0.5 + change * (0.5 * rho - 1.0 / 6.0))
+    less = y * change * (1.0 - change * (0.5 - change * (1.0 / 6.0 - change * (1.0 / 24.0))))
     wrong = 1.0 - (total - less) * q
-    return term, s - change, y - less, q + q * (wrong + wrong * wrong)
+    return term, s - change, y - less, q + q * (wrong * (1.0 + wrong * (1.0 + wrong)))
 
 
 @inner(fastmath=FAST, forceinline=True)
@@ -258,7 +260,7 @@ def correction(q, rho):
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilt(n, mu, variance):
-    """log p without log phi, and s, y and 1 / (y + r^2) to 1e-8."""
+    """log p without log phi, and s, y and 1 / (y + r^2) to 1e-11."""
     inverse = 1.0 / variance
     omega, known = rough_omega(rough_x(n, mu, inverse))
     s = n * inverse - omega
