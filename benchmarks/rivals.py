@@ -53,12 +53,17 @@ DOTS = tuple(Case(f"{n:,.0f} photons", 5.0, n, dots=True) for n in (2e3, 2e4, 1e
 
 
 class Method(NamedTuple):
-    """What is compared: a name, what it does, and the package that it needs, if any."""
+    """What is compared: a name, what it does, and the packages that it needs, if any."""
 
     name: str
     field: Callable[[Frame], by.Found]
-    needs: str = "bayesfred"
+    needs: tuple[str, ...] = ()
     remedy: bool = False  # where a case has one
+
+    @property
+    def missing(self) -> list[str]:
+        """Of those, what is not installed."""
+        return [package for package in self.needs if not find_spec(package)]
 
 
 def _on(centroids: Callable[[Frame], by.Centroids], fit: Callable[..., by.Found]) -> partial:
@@ -79,18 +84,18 @@ ON_STARS = (
     *OWN,
     Method("given places", by.fit_from_places),
     Method("remedy", by.fit_remedied, remedy=True),
-    Method("PSF fits", _on(by.psf_photometry, by.polynomial), "photutils"),
-    Method("PSF fits, SIP", _on(by.psf_photometry, by.sip), "photutils"),
-    Method("ePSF fits", _on(by.epsf_photometry, by.polynomial), "photutils", remedy=True),
-    Method("2-D Gaussians", _on(by.gaussian_centroids, by.polynomial), "photutils"),
-    Method("windowed", _on(by.windowed_centroids, by.polynomial), "sep"),
+    Method("PSF fits", _on(by.psf_photometry, by.polynomial), ("photutils",)),
+    Method("PSF fits, SIP", _on(by.psf_photometry, by.sip), ("photutils",)),
+    Method("ePSF fits", _on(by.epsf_photometry, by.polynomial), ("photutils",), remedy=True),
+    Method("2-D Gaussians", _on(by.gaussian_centroids, by.polynomial), ("photutils",)),
+    Method("windowed", _on(by.windowed_centroids, by.polynomial), ("sep",)),
     Method("scipy, image", by.least_squares),
 )
 ON_DOTS = (
     *OWN,
-    Method("OpenCV, its circles", _on(by.circles, by.camera), "cv2"),
-    Method("OpenCV, windowed", _on(by.windowed_centroids, by.camera), "cv2"),
-    Method("OpenCV, 2-D Gaussians", _on(by.gaussian_centroids, by.camera), "cv2"),
+    Method("OpenCV, its circles", _on(by.circles, by.camera), ("cv2",)),
+    Method("OpenCV, windowed", _on(by.windowed_centroids, by.camera), ("cv2", "sep")),
+    Method("OpenCV, 2-D Gaussians", _on(by.gaussian_centroids, by.camera), ("cv2", "photutils")),
 )
 
 
@@ -164,7 +169,7 @@ def compare(
     title: str, cases: Sequence[Case], methods: Sequence[Method], frames: int
 ) -> tuple[Table, Table, list[list[Score | None]]]:
     """Two tables, of errors with coverage and of times, and the scores."""
-    present = [method for method in methods if find_spec(method.needs)]
+    present = [method for method in methods if not method.missing]
     rows: list[list[Score | None]] = []
     for k, case in enumerate(cases):
         print(f"{title}: {k + 1} of {len(cases)}, {case.fwhm} px, {case.name}", file=sys.stderr)
