@@ -122,7 +122,7 @@ def _fill_means(image, level, response, out):
         out[i] = (image[i] + level) * response[i]
 
 
-@inner()
+@inner(inline="always")
 def sum_scaled(noise, counts, mean, place):
     """The sum of log_density over segments whose means (image, level, response) are scaled.
 

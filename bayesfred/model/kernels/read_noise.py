@@ -12,8 +12,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
-from numba.extending import overload
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
@@ -23,6 +21,7 @@ from bayesfred.model.kernels.contexts import LIMIT, MASKED
 from bayesfred.model.kernels.cumulants import CumulantTable
 from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
 from bayesfred.model.kernels.poisson_gaussian import (
+    at,
     density_of,
     derivatives_of,
     kind_of,
@@ -67,7 +66,7 @@ class ReadNoiseTerms(NamedTuple):
     @staticmethod
     def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         """log p less what depends on n alone."""
-        return density_of(noise.kind, n, mu, _at(noise.variance, p)) if mu >= 0.0 else MASKED
+        return density_of(noise.kind, n, mu, at(noise.variance, p)) if mu >= 0.0 else MASKED
 
     @staticmethod
     def summed(noise: Any, values: Any, light: Any, image: Any, level: Any, place: Any) -> Any:
@@ -77,33 +76,22 @@ class ReadNoiseTerms(NamedTuple):
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
         """Score, weight and C."""
-        return derivatives_of(noise.kind, n, mu, _at(noise.variance, p))
+        return derivatives_of(noise.kind, n, mu, at(noise.variance, p))
 
     @staticmethod
     def information(noise: Any, mu: Any, light: Any, p: Any) -> Any:
         """The expectation of the weight."""
-        return _information(noise, mu, _at(noise.variance, p), _at(noise.row, p))
+        return _information(noise, mu, at(noise.variance, p), at(noise.row, p))
 
     @staticmethod
     def spread(noise: Any, mu: Any, p: Any) -> Any:
         """Variance of the counts, and its slope."""
-        return max(mu, 0.0) + _at(noise.variance, p), 1.0
+        return max(mu, 0.0) + at(noise.variance, p), 1.0
 
     @staticmethod
     def unreached(noise: Any, rest: Any, level: Any) -> Any:
         """Sums over the pixels that no source reaches."""
         return sum_unreached(noise, rest, level)
-
-
-def _at(values: Any, p: Any) -> Any:
-    raise NotImplementedError("for compiled code")
-
-
-@overload(_at, inline="always", strict=False)
-def _choose_at(values: Any, p: Any) -> Any:
-    if isinstance(values, types.Array):
-        return lambda values, p: values[p]
-    return lambda values, p: values
 
 
 @inner()
