@@ -208,7 +208,7 @@ def main() -> int:
         return with_threads(1, lambda: noisy.log_prob(truth))
 
     pixels, side = np.random.default_rng(1), m.detector.shape
-    flat_fielded = bf.FlatFieldNoise(bf.PoissonNoise(), pixels.uniform(0.5, 1.5, side))
+    flat, read_noises = pixels.uniform(0.5, 1.5, side), pixels.uniform(1.0, 3.0, side)
 
     # the same sources in four times the empty frame, their pixels within the smaller one too
     inner, outer = (
@@ -269,8 +269,11 @@ def main() -> int:
             for name, noise in (
                 ("read noise 0.5", bf.PoissonNoise(0.5)),
                 ("read noise 2", bf.PoissonNoise(2.0)),
-                ("a map of read noises", bf.PoissonNoise(pixels.uniform(1.0, 3.0, side))),
-                ("a flat field", flat_fielded),
+                ("a map of read noises", bf.PoissonNoise(read_noises)),
+                ("a map below 1", bf.PoissonNoise(0.25 * read_noises)),
+                ("a flat field", bf.FlatFieldNoise(bf.PoissonNoise(), flat)),
+                ("flat field, read noise 2", bf.FlatFieldNoise(bf.PoissonNoise(2.0), flat)),
+                ("flat field, a map", bf.FlatFieldNoise(bf.PoissonNoise(read_noises), flat)),
             )
         ),
         (

@@ -237,7 +237,7 @@ def improved(n, mu, variance, s, y, q):
     third = change * rho * (1.0 / 6.0 + change * (0.125 * rho - 1.0 / 24.0))
     term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + third)
     change *= 1.0 + change * rho * (0.5 + change * (0.5 * rho - 1.0 / 6.0))
-    less = y * change * (1.0 - change * (0.5 - change * (1.0 / 6.0 - change * (1.0 / 24.0))))
+    less -= variance * change  # y + r^2 s = n
     wrong = 1.0 - (total - less) * q
     return term, s - change, y - less, q + q * (wrong * (1.0 + wrong * (1.0 + wrong)))
 
