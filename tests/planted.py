@@ -16,7 +16,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import GaussianPSF, MoffatPSF
+from bayesfred.imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
 from bayesfred.model.noise import simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
@@ -212,6 +212,47 @@ def uncatalogued(seed: int) -> Posterior:
     return Posterior(camera(few), counts(camera(s), seed))
 
 
+def companions(seed: int, **nuisances: Any) -> Posterior:
+    """Half of the sources have a companion of a tenth of their flux that no catalogue has."""
+    s, rng = field(seed), np.random.default_rng(seed + 20_000)
+    half, angle = np.arange(0, len(s), 2), rng.uniform(0.0, 2.0 * np.pi, len(s) // 2)
+    x = np.append(s.x, s.x[half] + 2.4 * SIGMA * np.cos(angle))
+    y = np.append(s.y, s.y[half] + 2.4 * SIGMA * np.sin(angle))
+    whole = SourceCatalog(x, y, 10.0 * np.append(s.flux, 0.1 * s.flux[half]))
+    few = replace(s, flux=10.0 * s.flux)
+    return Posterior(camera(few), counts(camera(whole), seed), nuisances=Nuisances(**nuisances))
+
+
+def free_companions(seed: int) -> Posterior:
+    return companions(seed, flux="free", offset=True, psf_sigma=True)
+
+
+def coma(seed: int) -> Posterior:
+    """The PSF trails to one side, and its Gaussian's width is fitted."""
+    s = field(seed)
+    a = np.arange(-60, 61) / 6.0
+    psf = SampledPSF(
+        sum(
+            share * np.exp(-0.5 * ((a - by) ** 2 + a[:, None] ** 2) / SIGMA**2)
+            for share, by in ((0.7, -0.6), (0.2, 0.6), (0.1, 2.8))
+        ),
+        6.0,
+    )
+    bright = replace(s, flux=10.0 * s.flux)
+    return Posterior(
+        camera(bright), counts(camera(bright, psf=psf), seed),
+        nuisances=Nuisances(flux="free", offset=True, psf_sigma=True),
+    )  # fmt: skip
+
+
+def scatter(seed: int) -> Posterior:
+    """Positions of the catalogue are wrong by 0.3 pixels."""
+    s, rng = field(seed), np.random.default_rng(seed + 20_000)
+    s = replace(s, flux=10.0 * s.flux)
+    x, y = np.stack([s.x, s.y]) + rng.normal(0.0, 0.3, (2, len(s)))
+    return Posterior(camera(moved(s, x, y)), counts(camera(s), seed))
+
+
 def fluxes(seed: int) -> Posterior:
     """Fluxes are taken to be exact, and are known to 40 %."""
     s, rng = field(seed), np.random.default_rng(seed + 20_000)
@@ -271,6 +312,10 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "wrong positions of few": (wrong_sources, ("wrong sources",)),
     "wrong fluxes of few": (wrong_fluxes_of_few, ("wrong sources",)),
     "uncatalogued sources": (uncatalogued, ("uncatalogued sources",)),
+    "companions": (companions, ("companions",)),
+    "companions, all free": (free_companions, ("companions",)),
+    "coma": (coma, ("PSF",)),
+    "scatter": (scatter, ("positions",)),
     "fluxes": (fluxes, ("fluxes",)),
     "a factor of all fluxes": (flux_scale, ("fluxes",)),
     "PSF too wide": (wide_psf, ("PSF",)),

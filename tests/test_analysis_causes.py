@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import planted
 import pytest
+from scipy import stats
 
 from bayesfred.analysis.causes import Cause, find_causes
 from bayesfred.analysis.causes.cause import Finding
@@ -20,7 +21,7 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.fit_statistics import fit_statistics
 
 FRAMES = 50
@@ -58,6 +59,28 @@ def test_planted_fault_is_named_first_in_nine_of_ten_frames(
     hits = named_first(name, range(1, FRAMES + 1))
     record_property("named first, of 50", hits)
     assert hits >= 0.9 * FRAMES
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize("name", [n for n, (_, right) in planted.FAULTS.items() if "PSF" in right])
+def test_a_wrong_psf_is_not_called_companions(name: str, record_property: Any) -> None:
+    """Of 50 frames at most 2: a rate of 0.04 has a binomial error of 0.03."""
+    plant, _ = planted.FAULTS[name]
+    named = [{cause.name for cause in judged(plant(seed)).causes} for seed in range(1, FRAMES + 1)]
+    false = sum("companions" in names for names in named)
+    record_property("companions named, of 50", false)
+    assert false <= 0.04 * FRAMES
+
+
+def test_leaving_out_outliers_cures_companions() -> None:
+    """The remedy that the verdict names: coefficients within their errors, which they were not."""
+    posterior = planted.companions(101)
+    kept, cured = reject_outliers(posterior)
+    for estimate, is_cured in ((find_map(posterior), False), (cured, True)):
+        off = (estimate.params - np.append(planted.THETA, planted.LEVEL))[:4]
+        inverse = np.linalg.inv(estimate.covariance[:4, :4])
+        assert (off @ inverse @ off < stats.chi2(4).isf(1e-4)) == is_cured
+    assert kept.mask.sum() < posterior.mask.sum()
 
 
 def test_a_true_model_has_no_cause() -> None:

@@ -13,7 +13,9 @@ near zero for a true model, and a cause explains the part of E that would go wit
 - a source that is imaged at a distance e from its light, and is put right, explains (q + q') (1 -
   exp(-e^2 / 4 s^2)), with the PSF's width s and its squared signal to noise: q where the model has
   light that is not there, q' where there is light that the model does not have;
-- pixels or sources that are to be left out explain what they hold, less what their like hold.
+- pixels or sources that are to be left out explain what they hold, less what their like hold;
+- another PSF explains what all sources have in common, in proportion to their flux, and companions
+  that no catalogue has the best peak beside each source in what is left.
 
 So the ranking is by shares of E, not by a list of special cases. Two rules keep it honest. Some
 hypotheses contain others: a shift is also an affine map, a factor of all fluxes is also a wrong

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+RICHER = 0.9  # weight of a hypothesis that contains others
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -12,7 +14,7 @@ class Cause:
     name : str
         One of "saturation", "gain", "read noise", "pedestal", "over-dispersion", "background",
         "unmatched", "origin", "parity", "shift", "rotation or scale", "missing terms",
-        "wrong sources", "positions", "uncatalogued sources", "fluxes" and "PSF".
+        "wrong sources", "positions", "uncatalogued sources", "companions", "fluxes" and "PSF".
     share : float
         Part of the misfit that it explains, from 0 to 1; 1 also where nothing can be judged.
     sentence : str
@@ -38,7 +40,7 @@ class Finding:
     explained : float
         Sum of squares that it explains.
     family : str
-        Hypotheses of one family explain the same squares.
+        Hypotheses that share a word of it explain the same squares.
     weight : float
         Factor below 1 of a hypothesis that contains others and has to explain more than they.
     """
@@ -47,3 +49,7 @@ class Finding:
     explained: float
     family: str
     weight: float = 1.0
+
+    def shares(self, other: "Finding") -> bool:
+        """Whether both explain the same squares."""
+        return not set(self.family.split()).isdisjoint(other.family.split())

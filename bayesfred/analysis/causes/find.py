@@ -7,9 +7,9 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.context import Context
-from bayesfred.analysis.causes.light import fluxes, psf, single_sources
+from bayesfred.analysis.causes.light import companions, fluxes, psf, single_sources
 from bayesfred.analysis.causes.pixels import background_and_noise, saturation
-from bayesfred.analysis.causes.positions import placement, unmatched
+from bayesfred.analysis.causes.positions import placement, scatter, unmatched
 from bayesfred.model.posterior import Posterior
 
 NOTICEABLE = 5.0  # standard deviations of a misfit
@@ -56,7 +56,8 @@ def find_causes(posterior: Posterior, params: Floats) -> tuple[Cause, ...]:
         place = placement(context)
         findings += [place, *background_and_noise(context)]
         if place is None or place.cause.name != "unmatched":
-            findings += [fluxes(context), psf(context), *single_sources(context)]
+            findings += [fluxes(context), psf(context), companions(context), scatter(context)]
+            findings += single_sources(context)
     else:
         findings += [unmatched(context), *background_and_noise(context)]
     return ranked([f for f in findings if f is not None], total)
@@ -70,7 +71,7 @@ def ranked(findings: list[Finding], total: float) -> tuple[Cause, ...]:
     while rest:
         best = max(rest, key=lambda f: f.weight * f.explained)
         rest = [
-            replace(f, explained=f.explained - best.explained * (f.family == best.family))
+            replace(f, explained=f.explained - best.explained * f.shares(best))
             for f in rest
             if f is not best
         ]

@@ -1,20 +1,26 @@
-"""Hypotheses about the sources' light: fluxes, the PSF, single sources, what no catalogue has."""
+"""Hypotheses about the sources' light: fluxes, the PSF, single sources, what no catalogue has.
+
+A wrong PSF leaves the same residual at all sources, in proportion to their flux; companions that no
+catalogue has leave one at some sources, in different directions. So what sources have in common is
+taken off before companions are looked for.
+"""
 
 from collections.abc import Iterator
 
 import numpy as np
+from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
-from bayesfred.analysis.causes.cause import Cause, Finding
-from bayesfred.analysis.causes.context import BRIGHT, Context
+from bayesfred.analysis.causes.cause import RICHER, Cause, Finding
+from bayesfred.analysis.causes.common import REACH, RINGS, common_pattern
+from bayesfred.analysis.causes.context import BRIGHT, DETECTED, Context
 
 ENOUGH = 0.85  # of what fluxes of their own explain
-RICHER = 0.9  # weight of a hypothesis that contains others
 FEW = 0.2  # of the sources: more than these are not the ones to blame
 OUTLYING = 6.0  # times the typical misfit of a source as bright
 NOTICEABLE = 6.0  # standard deviations
 NAMED = 5  # sources listed
-RINGS, REACH = 8, 4.0  # of the PSF's residual, and their outer radius in PSF widths
+ORDERS = range(5)  # of the pattern that is no companion, coma and trefoil included
 
 
 def fluxes(context: Context) -> Finding | None:
@@ -88,40 +94,11 @@ def single_sources(context: Context) -> Iterator[Finding]:
 def psf(context: Context) -> Finding | None:
     """Residuals that all sources share: another profile than the model's.
 
-    Stacked around the sources' images, relative to their fluxes, in rings and in the two ways in
-    which a ring can be drawn out, each constant or linear over the field. A dipole is left out: it
-    is a displacement.
+    Rings, and the two ways in which a ring can be drawn out. A dipole is left out: it is a
+    displacement.
     """
-    light, s = context.light, context.light.width
-    good = light.matched & (context.power > BRIGHT)
-    if good.sum() < 2:
-        return None
-    near = context.used & (context.distance <= REACH * s + 1.0)
-    near &= good[context.owner] & (context.owner >= 0)
-    row, column = np.nonzero(near)
-    source = context.owner[row, column]
-    shape = np.array(context.expected.shape)
-    u = column - 0.5 * (shape[1] - 1.0) - light.position[source, 0]
-    v = row - 0.5 * (shape[0] - 1.0) - light.position[source, 1]
-    flux = np.maximum(context.posterior.fluxes(context.params), 0.0)[source]
-    template = flux / np.sqrt(context.variance[row, column])
-    z = context.z[row, column]
-    radius, angle = np.hypot(u, v), 2.0 * np.arctan2(v, u)
-    ring = np.minimum((radius / (REACH * s) * RINGS).astype(int), RINGS)
-    inside = ring < RINGS
-    x, y = (c / (0.5 * shape.max()) for c in light.position[source].T)
-    shapes = [np.ones(z.size), np.cos(angle), np.sin(angle)]
-    over = [np.ones(z.size)] if good.sum() < 12 else [np.ones(z.size), x, y]
-    explained, profile = 0.0, np.zeros(RINGS)
-    for k in range(RINGS):
-        here = inside & (ring == k)
-        if here.sum() < 5:
-            continue
-        columns = np.stack([(a * b * template)[here] for a in shapes for b in over], axis=1)
-        found, *_ = np.linalg.lstsq(columns, z[here], rcond=1e-10)
-        explained += float(np.sum((columns @ found) ** 2)) - columns.shape[1]
-        profile[k] = float(columns[:, 0] @ z[here] / max(columns[:, 0] @ columns[:, 0], 1e-300))
-    return _shape(context, explained, profile)
+    found = common_pattern(context, (0, 2))
+    return None if found is None else _shape(context, found.explained, found.profile)
 
 
 def _shape(context: Context, explained: float, profile: Floats) -> Finding | None:
@@ -151,3 +128,39 @@ def _turns(profile: Floats) -> str:
     large: Flags = np.abs(profile) > 0.1 * np.abs(profile).max()
     signs = np.sign(profile[large])
     return ", and the opposite farther out or in" if np.any(signs != signs[0]) else ""
+
+
+def companions(context: Context) -> Finding | None:
+    """Light beside the sources that is not their PSF's and in no catalogue.
+
+    The best place of one companion to each source, by a matched filter.
+    """
+    found = common_pattern(context, ORDERS)
+    if found is None:
+        return None
+    s, shape, used = context.light.width, context.expected.shape, context.used
+    z = np.zeros(shape)
+    z[found.pixels] = context.z[found.pixels] - found.pattern
+    inverse = np.where(used, 1.0 / context.variance, 0.0)
+    pull = ndimage.gaussian_filter(z * np.sqrt(inverse), s, mode="constant")
+    information = ndimage.gaussian_filter(inverse, s / 2.0**0.5, mode="constant")
+    power = np.maximum(pull, 0.0) ** 2 * 4.0 * np.pi * s**2 / np.maximum(information, 1e-300)
+    best = np.zeros(context.flux.size)
+    np.maximum.at(best, found.source, power[found.pixels])
+    some = best > DETECTED**2
+    if not some.any():
+        return None
+    first = int(np.argmax(best))
+    here = np.flatnonzero(found.source == first)
+    pixel = here[np.argmax(power[found.pixels][here])]
+    catalog = context.posterior.model.sources
+    cause = Cause(
+        "companions", 0.0,
+        f"beside {some.sum()} of {context.light.matched.sum()} sources there is light of no "
+        "catalogued source, which differs from source to source, as that of a wrong PSF would "
+        f"not: the most at {np.hypot(found.u[pixel], found.v[pixel]):.1f} pixels from row {first} "
+        f"of the catalogue, from 0, at x, y = {catalog.x[first]:.1f}, {catalog.y[first]:.1f}",
+        "set frame.reject_outliers = true, which leaves out the sources concerned, or complete the "
+        "catalogue",
+    )  # fmt: skip
+    return Finding(cause, float(best[some].sum()), "light position", RICHER)

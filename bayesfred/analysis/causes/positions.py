@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.analysis.causes.cause import Cause, Finding
-from bayesfred.analysis.causes.context import Context
+from bayesfred.analysis.causes.cause import RICHER, Cause, Finding
+from bayesfred.analysis.causes.context import BRIGHT, Context
 from bayesfred.analysis.causes.search import Placement, find_placement
 from bayesfred.optimize.matching import Field
 
@@ -62,6 +62,26 @@ def placement(context: Context) -> Finding | None:
         context.power[near],
     )  # fmt: skip
     return _patterns(context, measured)
+
+
+def scatter(context: Context) -> Finding | None:
+    """Displacements that every source has for itself: those that no pattern describes."""
+    light = context.light
+    near = np.flatnonzero(light.matched & (context.power > BRIGHT))
+    if context.posterior.nuisances.position_scatter or near.size < 2:
+        return None
+    measured = Displaced(near, light.position[near], light.displacement[near], context.power[near])
+    for matrix in _designs(context, measured)[-1:]:
+        measured = measured._replace(displacement=_rest(matrix, measured))
+    own = measured.displacement
+    explained = _gained(context, measured, np.zeros_like(own)) - own.size
+    size = float(np.median(np.abs(own))) / 0.6745
+    cause = Cause(
+        "positions", 0.0,
+        f"the sources lie off their places, by {size:.2g} pixels along each axis (68 % of them)",
+        'set nuisances.flux = "free" and nuisances.position_scatter = true',
+    )  # fmt: skip
+    return Finding(cause, explained, "light position", RICHER) if explained > 0.0 else None
 
 
 def unmatched(context: Context) -> Finding:

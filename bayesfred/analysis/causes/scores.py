@@ -8,9 +8,9 @@ squares. Numbers in the model explain the squares of their scores, one beside th
 import numpy as np
 
 from bayesfred._typing import Ints
-from bayesfred.analysis.causes.cause import Cause, Finding
+from bayesfred.analysis.causes.cause import RICHER, Cause, Finding
 from bayesfred.analysis.causes.find import ranked
-from bayesfred.analysis.causes.light import FEW, NAMED, RICHER
+from bayesfred.analysis.causes.light import FEW, NAMED
 from bayesfred.analysis.score_tests import Lead, ScoreTests
 from bayesfred.analysis.source_tests import KINDS, SourceTests
 from bayesfred.model.posterior import Posterior
