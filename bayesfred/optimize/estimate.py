@@ -65,7 +65,9 @@ class MapEstimate:
     params : ndarray, shape (d,)
         Most probable parameters, in the order of `Posterior.parameter_names`.
     covariance : ndarray, shape (d, d)
-        Inverse of Fisher information plus prior curvature there: the Laplace approximation.
+        Inverse of Fisher information plus prior curvature there: the Laplace approximation. It
+        takes the model as true. Where `fits_data` is False the errors are too small, and are not
+        widened here.
     log_prob : float
         Log-posterior density there.
     n_evaluations : int
