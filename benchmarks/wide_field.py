@@ -4,7 +4,8 @@
 A lens of order 5 moves them by up to 30 pixels, their coma grows outward, and there are twice as
 many fainter stars that no catalogue has. Fluxes, the PSF's width and the scatter of positions are
 free; the PSF that is fitted is a Gaussian without coma. Printed are the processor's seconds of the
-search, compilation left out, and what it ends with.
+search, compilation left out, and what it ends with: once of all pixels, once with outliers left
+out.
 """
 
 import math
@@ -58,14 +59,17 @@ def main() -> int:
     few, _ = draw(12, 1)
     few.gradient(few.start()), few.fisher(few.start())  # compiled before any time is taken
     posterior, theta = draw(stars, 1)
-    start = time.process_time()
-    estimate = bf.find_map(posterior)
-    seconds = time.process_time() - start
-    errors = np.sqrt(np.diag(estimate.covariance))[: theta.size]
-    off = np.abs(estimate.params[: theta.size] - theta) / errors
-    print(f"{stars} stars: {seconds:.0f} s (bound {BOUND:g}); {estimate.message}")
-    print(f"coefficients off by {np.median(off):.1f} of their errors, at most {off.max():.1f}")
-    return 0 if estimate.at_maximum and seconds <= BOUND else 1
+    within = True
+    for search in (bf.find_map, lambda posterior: bf.reject_outliers(posterior)[1]):
+        start = time.process_time()
+        estimate = search(posterior)
+        seconds = time.process_time() - start
+        errors = np.sqrt(np.diag(estimate.covariance))[: theta.size]
+        off = np.abs(estimate.params[: theta.size] - theta) / errors
+        print(f"{stars} stars: {seconds:.0f} s (bound {BOUND:g}); {estimate.message}")
+        print(f"coefficients off by {np.median(off):.1f} of their errors, at most {off.max():.1f}")
+        within &= seconds <= BOUND
+    return 0 if within else 1
 
 
 if __name__ == "__main__":

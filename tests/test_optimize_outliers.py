@@ -17,6 +17,7 @@ from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize import outliers
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.matching import Field
@@ -319,3 +320,27 @@ def test_crowded_fields_are_right_or_said_not_to_fit(monkeypatch: pytest.MonkeyP
         assert not (wrong and estimate.fits_data), f"seed {seed}: {estimate.message}"
     assert right >= 20
     assert silent >= 1
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.3])
+def test_looks_at_parts_of_a_frame_find_what_looks_at_all_of_it_do(
+    tolerance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior, truth, *_ = frame(3, spacing=12.0)
+    posterior.mask[40:60, 70:90] = False
+    wrong = truth + np.append(0.3 * truth[:-1], 0.0)
+
+    def found() -> tuple[Any, Any]:
+        return outliers._Residuals(posterior, wrong).outliers(tolerance)
+
+    monkeypatch.setattr(outliers, "MOSTLY", 1.0)
+    in_parts = found()
+    ny, nx = posterior.mask.shape
+    everything = [(slice(0, ny), slice(0, nx))]
+    monkeypatch.setattr(outliers._Residuals, "_regions", lambda self, some: everything)
+    whole = found()
+    assert all(np.array_equal(a, b) for a, b in zip(in_parts, whole, strict=True))
+    assert whole[0].any() and not whole[1].all()
+    # negative control: later looks are needed
+    monkeypatch.setattr(outliers, "LOOKS", 1)
+    assert not np.array_equal(found()[1], whole[1])

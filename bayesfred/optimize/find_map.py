@@ -21,7 +21,7 @@ from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
 from bayesfred.optimize.joint_map import maximize_frames
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.modes import ModeSearch, find_modes
-from bayesfred.optimize.newton import NewtonResult, maximize
+from bayesfred.optimize.newton import NEAR, NewtonResult, maximize
 from bayesfred.optimize.outliers import BREAKDOWN, COARSE, Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
 
@@ -218,7 +218,7 @@ def _search(
             evaluations += spent + again.evaluations
             if top is None or again.distance < CLOSENESS:
                 top, found, path = again, kept, begun.path
-            if again.distance < CLOSENESS:
+            if again.distance < NEAR:  # a rough top: other starts end there, too
                 break
         assert top is not None, "a first start"
         search = find_modes(found.posterior, top)
@@ -319,7 +319,11 @@ def _estimate(
     if at_bound := [name for name, x, low, high in bounds if x in (low, high)]:
         message += f", {', '.join(at_bound)} at a bound of the prior"
     if not at_maximum:
-        remedy = "begin elsewhere (start), fit fewer terms, or narrow the priors"
+        remedy = (
+            "no step comes closer, as where hardly a pixel of a source is used"
+            if top.distance < NEAR
+            else "begin elsewhere (start), fit fewer terms, or narrow the priors"
+        )
         message = f"not found, {message}: {remedy}"
     else:
         message = f"found, {message}{advice and f'; {advice}'}"

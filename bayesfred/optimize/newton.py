@@ -28,6 +28,8 @@ from bayesfred.model.protocol import TargetDensity
 CLOSE_ENOUGH = 3e-4
 NEAR = 0.1  # the same where the number of steps is limited
 UNNOTICED = 1e-3  # of a log-posterior: a fall that is no reason to stop close to the maximum
+# The density is rough where, near the maximum, this many steps do not shorten the next one.
+PATIENCE, CLOSER = 2, 0.9
 MOST_EVALUATIONS = 300  # after which no more searches begin
 
 SECANTS = 10  # steps that correct the information
@@ -100,6 +102,7 @@ def maximize(
     params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
     low, high = posterior.support
     close_enough = CLOSE_ENOUGH if steps is None else NEAR
+    nearest, stalled = np.inf, 0
     points: deque[tuple[Floats, Floats]] = deque(maxlen=SECANTS + 1)
     while True:
         if information is None:
@@ -117,7 +120,14 @@ def maximize(
                 curvature = _corrected(information, points)
                 way = _newton_step(posterior.support, params, gradient, curvature)
         information = None
-        if newton.distance < close_enough or evaluations >= MOST_EVALUATIONS or taken == steps:
+        closer = newton.distance < CLOSER * nearest
+        nearest, stalled = (newton.distance, 0) if closer else (nearest, stalled + 1)
+        if (
+            newton.distance < close_enough
+            or (newton.distance < NEAR and stalled == PATIENCE)
+            or evaluations >= MOST_EVALUATIONS
+            or taken == steps
+        ):
             break
         gain, taken = -np.inf, taken + 1
         for fraction in 0.5 ** np.arange(10):

@@ -50,8 +50,12 @@ MOST = 0.7
 # right ones 0.27 to 0.48.
 BREAKDOWN = 0.4
 LOOKS = 10  # for peaks, also for those hidden by others
+MOSTLY = 0.5  # share of the frame's pixels in parts of it, from which it is filtered as a whole
 ROUNDS = 8
 STEPS = 8  # of Newton's method between two rejections
+
+
+Region = tuple[slice, slice]  # rows and columns
 
 
 class Kept(NamedTuple):
@@ -151,6 +155,7 @@ class _Residuals:
         self.flux = known.get("flux_scale", 1.0) * model.sources.flux
         self.height = 4.0 * np.pi * s**4  # of flux over height
         self.near = 2 * int(np.ceil(3.0 * s)) + 1
+        self.reach = int(4.0 * s + 0.5)  # of the filters
         self.noise, self.level = posterior.noise_at(params), known["background"]
         self.expected = posterior.expected_counts(params)
 
@@ -160,7 +165,34 @@ class _Residuals:
         return self._nearby(self.expected)
 
     def _nearby(self, expected: Floats) -> Floats:
-        return np.asarray(ndimage.maximum_filter(self._filtered(expected), self.near))
+        out = np.zeros_like(expected)
+        for region in self._regions(self.posterior.mask):
+            wide, core = self._wider(region)
+            filtered = self._filtered(expected[wide], self.posterior.mask[wide])
+            out[region] = ndimage.maximum_filter(filtered, self.near)[core]
+        return out
+
+    def _regions(self, some: Flags) -> list[Region]:
+        """Where filters see some pixels, as rectangles."""
+        shape, reach = some.shape, self.reach + self.near
+        found = []
+        for box in ndimage.find_objects(ndimage.label(some)[0]):
+            found.append(_padded(box, reach, shape))
+        area = sum((r.stop - r.start) * (c.stop - c.start) for r, c in found)
+        if area <= MOSTLY * some.size:
+            return found
+        rows, columns = (np.flatnonzero(some.any(axis=axis)) for axis in (1, 0))
+        box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        return [_padded(box, reach, shape)]
+
+    def _wider(self, region: Region) -> tuple[Region, Region]:
+        """A region with what filters see of its surroundings, and where the region is in that."""
+        wide = _padded(region, self.reach + self.near, self.expected.shape)
+        core = tuple(
+            slice(inner.start - outer.start, inner.stop - outer.start)
+            for inner, outer in zip(region, wide, strict=True)
+        )
+        return wide, (core[0], core[1])
 
     def share(self, lost: Flags) -> float:
         """Sources in the frame that are lost."""
@@ -173,41 +205,78 @@ class _Residuals:
 
     def outliers(self, tolerance: float) -> tuple[Flags, Flags]:
         """Which sources are missing, shape (n,), and the pixels without detections, (ny, nx)."""
-        p, s = self.posterior, self.width
-        missing, expected = np.zeros(self.flux.size, bool), self.expected
-        stars = self.stars if tolerance else None
-        light, mask = np.zeros(p.counts.shape), p.mask
+        p, missing, expected = self.posterior, np.zeros(self.flux.size, bool), self.expected
+        stars = tolerance * self.stars if tolerance else None
+        light, mask = np.zeros(p.counts.shape), p.mask.copy()
+        regions = self._regions(p.mask)
         for _ in range(LOOKS):
-            each = self.noise.counts_variance(expected + np.maximum(light, 0.0), self.level)
-            variance = ndimage.gaussian_filter(np.where(p.mask, each, 0.0), s)
-            limit = SIGNIFICANCE * np.sqrt(variance / (2.0 * np.pi * s**6))
-            limit += SIGNIFICANCE**2 / self.height
-            if stars is not None:
-                limit += tolerance * stars
-            excess = self._filtered(p.counts - expected - light)
-            height = np.abs(excess)
-            peak = (height > limit) & (height == ndimage.maximum_filter(height, self.near))
-            row, column = np.nonzero(peak)
-            if not row.size:
+            positions, flux = self._peaks(regions, expected, light, stars)
+            if not flux.size:
                 break
-            flux = self.height * excess[row, column]
-            positions = vertex(height, row, column)
             absent = self._absent(positions, flux, missing)
             missing[absent[absent >= 0]] = True
             if self.none_left(missing):
                 break
+            added = self._image(positions[absent < 0], flux[absent < 0])
+            light += added
+            changed = added != 0.0
             if np.any(absent >= 0):
-                expected = _part(p, missing, p.mask).expected_counts(self.params)
-                stars = self._nearby(expected) if tolerance else None
-            light += self._image(positions[absent < 0], flux[absent < 0])
-            wider = 2 * int(np.ceil(0.25 * s)) + 1  # for detections of another width
-            spread = ndimage.maximum_filter(np.abs(light), wider)
-            mask = p.mask & (
-                spread <= FAINT * np.sqrt(self.noise.counts_variance(expected, self.level))
-            )
+                before, expected = expected, _part(p, missing, p.mask).expected_counts(self.params)
+                stars = tolerance * self._nearby(expected) if tolerance else None
+                changed |= expected != before
+            # elsewhere another look would find what this one did
+            regions = self._regions(changed)
+            for region in regions:
+                mask[region] = self._without_detections(region, expected, light)
             if self.share(missing | ~mask[self.row, self.column]) > MOST:
                 break
         return missing, mask
+
+    def _peaks(
+        self, regions: list[Region], expected: Floats, light: Floats, stars: Floats | None
+    ) -> tuple[Floats, Floats]:
+        """What exceeds the noise and what is tolerated of the light of the stars nearby.
+
+        Returns
+        -------
+        positions : ndarray, shape (n, 2), recorded pixel
+            Row and column.
+        flux : ndarray, shape (n,), counts
+            Negative where light is missing.
+        """
+        p, s, nx = self.posterior, self.width, expected.shape[1]
+        pixels, positions, flux = [np.empty(0, int)], [np.empty((0, 2))], [np.empty(0)]
+        for region in regions:
+            wide, core = self._wider(region)
+            used, known = p.mask[wide], expected[wide] + np.maximum(light[wide], 0.0)
+            each = self.noise.at(wide).counts_variance(known, self.level)
+            variance = ndimage.gaussian_filter(np.where(used, each, 0.0), s)
+            limit = SIGNIFICANCE * np.sqrt(variance / (2.0 * np.pi * s**6))
+            limit += SIGNIFICANCE**2 / self.height
+            if stars is not None:
+                limit += stars[wide]
+            excess = self._filtered(p.counts[wide] - expected[wide] - light[wide], used)
+            height = np.abs(excess)
+            peak = np.zeros(used.shape, bool)
+            peak[core] = (height > limit)[core]
+            row, column = np.nonzero(peak)
+            highest = _highest(height, row, column, self.near // 2)
+            row, column = row[highest], column[highest]
+            origin = np.array([wide[0].start, wide[1].start])
+            pixels.append((row + origin[0]) * nx + column + origin[1])
+            positions.append(vertex(height, row, column) + origin)
+            flux.append(self.height * excess[row, column])
+        # regions overlap
+        first = np.unique(np.concatenate(pixels), return_index=True)[1]
+        return np.concatenate(positions)[first], np.concatenate(flux)[first]
+
+    def _without_detections(self, region: Region, expected: Floats, light: Floats) -> Flags:
+        """Which pixels of a region in use detections hardly reach."""
+        wide, core = self._wider(region)
+        wider = 2 * int(np.ceil(0.25 * self.width)) + 1  # for detections of another width
+        spread = ndimage.maximum_filter(np.abs(light[wide]), wider)[core]
+        variance = self.noise.at(region).counts_variance(expected[region], self.level)
+        return np.asarray(self.posterior.mask[region] & (spread <= FAINT * np.sqrt(variance)))
 
     def _absent(self, positions: Floats, flux: Floats, missing: Flags) -> Ints:
         """The source whose absence leaves a dark image with this flux; -1 where none does."""
@@ -239,10 +308,28 @@ class _Residuals:
             model, np.zeros_like(theta), u[~known], v[~known], flux[~known]
         )
 
-    def _filtered(self, image: Floats) -> Floats:
-        return np.asarray(
-            -ndimage.gaussian_laplace(np.where(self.posterior.mask, image, 0.0), self.width)
-        )
+    def _filtered(self, image: Floats, used: Flags) -> Floats:
+        return np.asarray(-ndimage.gaussian_laplace(np.where(used, image, 0.0), self.width))
+
+
+def _padded(box: Region, by: int, shape: tuple[int, ...]) -> Region:
+    row, column = (
+        slice(max(side.start - by, 0), min(side.stop + by, size))
+        for side, size in zip(box, shape, strict=True)
+    )
+    return row, column
+
+
+def _highest(height: Floats, row: Ints, column: Ints, near: int) -> Flags:
+    """Which pixels are the highest of all as near along either axis."""
+    ny, nx = height.shape
+    highest = np.ones(row.size, bool)
+    for i in range(-near, near + 1):
+        some = np.flatnonzero(highest)
+        rows = np.clip(row[some] + i, 0, ny - 1)[:, None]
+        columns = np.clip(column[some, None] + np.arange(-near, near + 1), 0, nx - 1)
+        highest[some] = height[rows, columns].max(axis=1) <= height[row[some], column[some]]
+    return highest
 
 
 def _signed_image(model: ForwardModel, theta: Floats, x: Floats, y: Floats, flux: Floats) -> Floats:
