@@ -8,6 +8,7 @@ row of `SOURCE_NUISANCES` and a field of the kernels' `Nuisance` tuple.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -147,6 +148,12 @@ class _SourceNuisance(NamedTuple):
     prior: Callable[[_Context], Any]
 
 
+# scipy takes a millisecond for each, longer than a likelihood
+@lru_cache(maxsize=4096)
+def _frozen(family: Any, *args: float, **kwds: float) -> Any:
+    return family(*args, **kwds)
+
+
 def _zero(sigma: float) -> float:
     return 0.0
 
@@ -161,27 +168,28 @@ def _width(sigma: float) -> float:
 
 SOURCE_NUISANCES = (
     _SourceNuisance(
-        "flux_scale", 0, lambda n: n.flux == "scale", _one, _one, lambda c: stats.lognorm(1.0)
+        "flux_scale", 0, lambda n: n.flux == "scale", _one, _one,
+        lambda c: _frozen(stats.lognorm, 1.0),
     ),
     _SourceNuisance(
         "offset_x", 1, lambda n: n.offset, _zero, _zero,
-        lambda c: stats.norm(0.0, 0.1 * c.half_width),
+        lambda c: _frozen(stats.norm, 0.0, 0.1 * c.half_width),
     ),
     _SourceNuisance(
         "offset_y", 1, lambda n: n.offset, _zero, _zero,
-        lambda c: stats.norm(0.0, 0.1 * c.half_height),
+        lambda c: _frozen(stats.norm, 0.0, 0.1 * c.half_height),
     ),
     _SourceNuisance(
         "psf_sigma", 1, lambda n: n.psf_sigma, _width, _width,
-        lambda c: stats.truncnorm(-0.4 / 0.3, 1.0 / 0.3, loc=c.sigma, scale=0.3 * c.sigma),
+        lambda c: _frozen(stats.truncnorm, -0.4 / 0.3, 1.0 / 0.3, loc=c.sigma, scale=0.3 * c.sigma),
     ),
     _SourceNuisance(
         "position_scatter", 1, lambda n: n.position_scatter, _zero, lambda sigma: 0.1 * sigma,
-        lambda c: stats.gamma(2.0, scale=0.1 * c.sigma),
+        lambda c: _frozen(stats.gamma, 2.0, scale=0.1 * c.sigma),
     ),
     _SourceNuisance(
         "model_error", 0, lambda n: n.model_error, _zero, lambda sigma: 0.01,
-        lambda c: stats.gamma(2.0, scale=0.02),
+        lambda c: _frozen(stats.gamma, 2.0, scale=0.02),
     ),
 )  # fmt: skip
 SCALES = ("position_scatter", "model_error")  # they leave the expected counts as they are
@@ -322,7 +330,7 @@ def _distortion_terms(model: ForwardModel, context: _Context) -> list[Parameter]
         i, j, m, n = term
         powers = tuple((v, p) for v, p in zip("uvxy", (m, n, i, j), strict=True) if p)
         letter, pixels = (name[0], 1 - sum(term)) if d.basis is None else ("", 0)
-        prior = stats.norm(0.0, scales[slot])
+        prior = _frozen(stats.norm, 0.0, float(scales[slot]))
         table.append(
             Parameter(name, letter, powers, "", pixels, 0.0, 0.0, prior, slot, "distortion")
         )
@@ -332,7 +340,9 @@ def _distortion_terms(model: ForwardModel, context: _Context) -> list[Parameter]
 def _background_term(slot: int, context: _Context) -> Parameter:
     constant = slot == 0
     prior = (
-        stats.halfnorm(0.0, 10.0 * context.level) if constant else stats.norm(0.0, context.level)
+        _frozen(stats.halfnorm, 0.0, 10.0 * context.level)
+        if constant
+        else _frozen(stats.norm, 0.0, context.level)
     )
     start = context.background if constant else 0.0
     powers = tuple((v, p) for v, p in zip("uv", BACKGROUND_POWERS[slot], strict=True) if p)

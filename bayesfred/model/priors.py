@@ -8,6 +8,7 @@ priors, which are weak, are in the table of `parameters`.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -47,10 +48,19 @@ DENSITIES: dict[str, Density] = {
 }
 
 
+@lru_cache(maxsize=4096)  # scipy is slow to say it
 def _standard(distribution: Any) -> tuple[tuple[float, ...], float, float]:
     """Shape parameters, location and scale of a frozen distribution."""
     shapes, loc, scale = distribution.dist._parse_args(*distribution.args, **distribution.kwds)
     return tuple(float(s) for s in shapes), float(loc), float(scale)
+
+
+@lru_cache(maxsize=4096)
+def _anchor(distribution: Any) -> tuple[float, float, float, float]:
+    """Both ends of the support, the median, and the log-density there."""
+    low, high = distribution.support()
+    middle = distribution.median()
+    return float(low), float(high), float(middle), float(distribution.logpdf(middle))
 
 
 def log_density(prior: Mapping[str, Any]) -> Callable[[Floats], Floats]:
@@ -64,11 +74,7 @@ def log_density(prior: Mapping[str, Any]) -> Callable[[Floats], Floats]:
         *rest, loc, scale = np.array(
             [(*s, loc, scale) for s, loc, scale in map(_standard, members)]
         ).T
-        low, high = np.array([distribution.support() for distribution in members]).T
-        middle = np.array([distribution.median() for distribution in members])
-        known = np.array(
-            [distribution.logpdf(x) for distribution, x in zip(members, middle, strict=True)]
-        )
+        low, high, middle, known = np.array([_anchor(member) for member in members]).T
         density, shapes = DENSITIES[name], tuple(rest)
         constant = known - density((middle - loc) / scale, shapes)[0]
         families.append((density, places, shapes, loc, scale, low, high, constant))

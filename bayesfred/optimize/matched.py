@@ -184,7 +184,7 @@ def _filtered(
     (r, variance), squares = gathered(here), (g_v**2, g_u**2)
 
     def total(image: Floats, along: tuple[Floats, Floats]) -> Floats:
-        return np.asarray(np.einsum("nvu,nv,nu->n", image, *along, optimize=True))
+        return np.sum((image @ along[1][:, :, None])[:, :, 0] * along[0], axis=1)
 
     return np.stack(
         [

@@ -11,6 +11,9 @@ surely. A star is matched when one peak alone lies where it may be. The prior ke
 running away; weights that fall with the residual keep wrong matches from bending it.
 """
 
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 from scipy import linalg, spatial
 
@@ -51,6 +54,13 @@ def _alone(model: ForwardModel) -> Flags:
     return np.asarray(np.hypot(*shift) < CROWDED * model.psf.sigma)
 
 
+@lru_cache(maxsize=4096)
+def _central(prior: Any) -> tuple[float, float, float]:
+    """The median of a distribution between the ends of its central 68 %."""
+    low, median, high = prior.ppf([0.16, 0.5, 0.84])
+    return float(low), float(median), float(high)
+
+
 class Field:
     """The catalogue's images under a distortion, and the equations that images give for it.
 
@@ -67,9 +77,7 @@ class Field:
             [*range(n), *(names.index(name) for name in ("offset_x", "offset_y") if name in names)]
         )
         marginals = [posterior.prior[names[k]] for k in self.columns]
-        low, self.centre, high = (
-            np.array([p.ppf(q) for p in marginals]) for q in (0.16, 0.5, 0.84)
-        )
+        low, self.centre, high = np.array([_central(prior) for prior in marginals]).T
         self.scale = 0.5 * looseness * (high - low)
         self.everyone = np.arange(len(posterior.model.sources))
         self.alone = _alone(posterior.model)
@@ -96,7 +104,7 @@ class Field:
     def spread(self, sources: Ints, position: Floats, covariance: Floats) -> Floats:
         """Standard deviation of predicted positions along the worse axis."""
         matrix = self.design(sources, position)
-        variance = np.einsum("ank,kl,anl->an", matrix, covariance, matrix, optimize=True)
+        variance = np.sum((matrix @ covariance) * matrix, axis=2)
         return np.asarray(np.sqrt(variance.max(axis=0)))
 
     def fit(self, sources: Ints, position: Floats, error: float) -> tuple[Floats, Floats]:
@@ -117,7 +125,7 @@ class Field:
             inverse = linalg.inv((matrix.T * weight) @ matrix / scale**2 + np.eye(self.scale.size))
             z = inverse @ (matrix.T @ (weight * right)) / scale**2
             # studentised: a fit follows a star that alone determines it, right or wrong
-            own = np.einsum("ik,kl,il->i", matrix, inverse, matrix, optimize=True)
+            own = np.sum((matrix @ inverse) * matrix, axis=1)
             leverage = np.minimum(weight * own / scale**2, 0.99)
             residual = np.hypot(*((right - matrix @ z) / np.sqrt(1.0 - leverage)).reshape(2, -1))
             # 1.18 is the median of a two-dimensional normal's distance
