@@ -25,6 +25,8 @@ def printable(text: str) -> str:
     >>> print(printable("two\nlines\x1b[31m"))
     two\nlines\x1b[31m
     """
+    if text.isprintable():  # images in pages are long
+        return text
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
     )

@@ -184,7 +184,8 @@ def _filtered(
     (r, variance), squares = gathered(here), (g_v**2, g_u**2)
 
     def total(image: Floats, along: tuple[Floats, Floats]) -> Floats:
-        return np.sum((image @ along[1][:, :, None])[:, :, 0] * along[0], axis=1)
+        rows = (image @ along[1][:, :, None])[:, :, 0]
+        return np.asarray(np.sum(rows * along[0], axis=1))
 
     return np.stack(
         [
