@@ -89,47 +89,71 @@ def add_squares(spacing, samples, some, weight, out):
 
 
 @inner()
-def _fill_light(samples, n, light, out):
-    """The light of all samples of sample n's pixel, times their B-splines.
+def _fill_light(samples, pixel, light, out, low, high):
+    """The light of a pixel's samples, times their B-splines.
 
-    `light` are the spacing of the splines' grid, the samples' pixels and their light.
+    `light` are the spacing of the splines' grid and the samples' light. Of every row of `out`, the
+    columns from `low` to `high` may hold some; they are emptied first.
     """
-    spacing, owner, every = light
-    pixel = owner[n]
+    (spacing, every), side = light, out.shape[0]
     wx, wy = np.empty(4), np.empty(4)
-    out[:] = 0.0
+    for row in range(side):
+        out[row, low[row] : high[row]] = 0.0
+        low[row], high[row] = side, 0
     for n in range(samples.first[pixel], samples.first[pixel + 1]):
-        i, j = find_splines(spacing, samples, n, out.shape[0], wx, wy)
+        i, j = find_splines(spacing, samples, n, side, wx, wy)
         for q in range(4):
+            low[j + q], high[j + q] = min(low[j + q], i), max(high[j + q], i + 4)
             for p in range(4):
                 out[j + q, i + p] += every[n] * wx[p] * wy[q]
+
+
+@inner()
+def _no_light(side):
+    """An empty grid, and the columns that hold light in its rows."""
+    return np.zeros((side, side)), np.full(side, side), np.zeros(side, np.int64)
+
+
+@inner(fastmath=FAST)
+def _add_rows(factor, lines, low, high, terms, target):
+    for row in range(low.size):
+        for o in range(terms * low[row], terms * high[row]):
+            target[row, o] += factor * lines[row, o]
 
 
 @entry()
 def add_light(samples, light, values, out):
     """Add the light of the samples' pixels times values, shape (s, values, side, side)."""
-    lit = np.empty((out.shape[2], out.shape[3]))
-    for n in range(samples.source.size):
-        _fill_light(samples, n, light, lit)
-        for k in range(out.shape[1]):
-            _add_line(values[n, k], lit.ravel(), out[samples.source[n], k].ravel())
+    lit, low, high = _no_light(out.shape[2])
+    for pixel in range(samples.first.size - 1):
+        _fill_light(samples, pixel, light, lit, low, high)
+        for n in range(samples.first[pixel], samples.first[pixel + 1]):
+            for k in range(out.shape[1]):
+                _add_rows(values[n, k], lit, low, high, 1, out[samples.source[n], k])
 
 
 @entry()
-def add_crosses(spacing, samples, some, weight, light, out):
-    """Add B-splines times weights and the light of the samples' pixels.
+def add_crosses(spacing, samples, weight, light, field, out):
+    """Add B-splines times weights, the light of the samples' pixels and the field's terms.
 
-    `out` has the shape (s, side, side, side of the light's grid, side of it).
+    `out` has the shape (side, side, side of the light's grid, side of it times terms).
     """
-    (begin, order), side = some, out.shape[1]
-    wx, wy, lit = np.empty(4), np.empty(4), np.empty((out.shape[3], out.shape[4]))
-    for n in order:
-        i, j = find_splines(spacing, samples, n, side, wx, wy)
-        if min(i, j) == 0 or max(i, j) == side - EDGE:
-            continue
-        _fill_light(samples, n, light, lit)
-        own = out[min(samples.source[n] - begin, out.shape[0] - 1)]
-        for q in range(4):
-            for p in range(4):
-                target = own[j + q, i + p].ravel()
-                _add_line(weight[n] * wx[p] * wy[q], lit.ravel(), target)
+    side, terms = out.shape[0], field.shape[1]
+    wx, wy = np.empty(4), np.empty(4)
+    lit, low, high = _no_light(out.shape[2])
+    each = np.empty((low.size, low.size * terms))
+    for pixel in range(samples.first.size - 1):
+        _fill_light(samples, pixel, light, lit, low, high)
+        for n in range(samples.first[pixel], samples.first[pixel + 1]):
+            i, j = find_splines(spacing, samples, n, side, wx, wy)
+            if min(i, j) == 0 or max(i, j) == side - EDGE:
+                continue
+            for row in range(low.size):
+                for column in range(low[row], high[row]):
+                    for t in range(terms):
+                        at = column * terms + t
+                        each[row, at] = lit[row, column] * field[samples.source[n], t]
+            for q in range(4):
+                for p in range(4):
+                    factor = weight[n] * wx[p] * wy[q]
+                    _add_rows(factor, each, low, high, terms, out[j + q, i + p])

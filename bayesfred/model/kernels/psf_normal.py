@@ -210,7 +210,6 @@ class _Weighed(NamedTuple):
     """The samples and what they weigh."""
 
     samples: SourceSamples
-    owner: Ints  # (samples,) their pixels
     light: Floats  # (samples,)
     weight: Floats  # (samples,) of their pixels
     field: Floats  # (s, terms)
@@ -255,7 +254,7 @@ def psf_information(
     kinds, size = _Kinds.of(levels), levels.size()
     owner = np.repeat(np.arange(weight.size), np.diff(samples.first))
     light = flux[samples.source] * samples.size
-    weighed = _Weighed(samples, owner, light, weight[owner], field)
+    weighed = _Weighed(samples, light, weight[owner], field)
     matrix, coupling = np.zeros((size, size)), np.zeros((TEMPLATES * flux.size, size))
     others = np.zeros((background.shape[1], size))
     columns = np.concatenate([templates, background.T[:, owner]]).T * weighed.weight[:, None]
@@ -358,27 +357,25 @@ def _add_wings(
 ) -> None:
     """Add what the level of wings shares, with all samples of a pixel together."""
     levels, k, samples, field = kinds.levels, kinds.wings[0], weighed.samples, weighed.field
-    side, wide = _padded(kinds.side), _padded(int(levels.side[k]))
-    light = levels.spacing[k], weighed.owner, weighed.light
-    squares = weighed.light * weighed.weight
-    crosses = np.zeros((field.shape[1], side**2 * wide**2))
-    for some, order in weighed.batches(crosses.shape[1]):
-        each = np.zeros((some.stop - some.start, side, side, wide, wide))
-        add_crosses(levels.spacing[0], samples, order, squares, light, each)
-        crosses += field[some].T @ each.reshape(len(each), -1)
-    own = (slice(EDGE, -EDGE),) * 4
-    shared = np.moveaxis(crosses.reshape(-1, side, side, wide, wide)[:, *own], [1, 2], [3, 4])
+    wide, inside = _padded(int(levels.side[k])), slice(EDGE, -EDGE)
+    light, squares = (levels.spacing[k], weighed.light), weighed.light * weighed.weight
+
+    def shared(other: int) -> Floats:
+        side, terms = _padded(int(levels.side[other])), field[:, levels.terms(other)]
+        out = np.zeros((side, side, wide, wide * terms.shape[1]))
+        terms = np.ascontiguousarray(terms)
+        add_crosses(levels.spacing[other], samples, squares, light, terms, out)
+        out = out.reshape(*out.shape[:3], wide, -1)[(inside,) * 4]
+        return np.moveaxis(out, 4, 2)  # (side, side, terms, side, side)
+
     for narrow in kinds.narrow:
-        coarse = kinds.on_level(narrow, shared[levels.terms(narrow)])
-        levels.block(narrow, k, matrix)[..., 0] = np.moveaxis(coarse, [3, 4, 0], [0, 1, 2])
-    every = 0, np.arange(samples.source.size)
-    both = np.zeros((1, wide, wide, wide, wide))
-    add_crosses(levels.spacing[k], samples, every, squares, light, both)
-    levels.block(k, k, matrix)[:, :, 0, :, :, 0] = 0.5 * both[0][own]
+        levels.block(narrow, k, matrix)[..., 0] = shared(narrow)
+    levels.block(k, k, matrix)[..., 0] = 0.5 * shared(k)
     lit = np.zeros((len(field), TEMPLATES, wide, wide))
     add_light(samples, light, columns, lit)
     rows = levels.part(k, coupling)[..., 0]
-    rows[:] = lit[..., *own[:2]].reshape(rows.shape)
+    rows[:] = lit[..., inside, inside].reshape(rows.shape)
+    every = 0, np.arange(samples.source.size)
     sums = np.zeros((1, wide, wide, columns.shape[1]))
     add_values(levels.spacing[k], samples, every, columns * weighed.light[:, None], sums)
     levels.part(k, others)[..., 0] = np.moveaxis(_own(sums)[0, :, :, TEMPLATES:], -1, 0)
