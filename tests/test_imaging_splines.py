@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+from bayesfred.imaging.kernels.psf_dispatch import find_places, new_places
 from bayesfred.imaging.kernels.splines import (
     spline_cell,
     spline_second_derivatives,
     spline_slopes,
-    spline_value,
 )
+from bayesfred.imaging.psf.sampled import spline_profile
 
 ROWS, COLUMNS = 9, 12  # not square, so that the two axes cannot be mistaken for each other
 
-VALUE = [(0, 0)]
 SLOPES = [(0, 0), (0, 1), (1, 0)]
 SECOND = [(0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
 
@@ -51,7 +51,7 @@ def basis(z: np.ndarray, size: int, order: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("function", "orders"),
-    [(spline_value, VALUE), (spline_slopes, SLOPES), (spline_second_derivatives, SECOND)],
+    [(spline_slopes, SLOPES), (spline_second_derivatives, SECOND)],
 )
 def test_sums_are_scipys(function: Any, orders: list[tuple[int, int]]) -> None:
     rng = np.random.default_rng(1)
@@ -64,3 +64,33 @@ def test_sums_are_scipys(function: Any, orders: list[tuple[int, int]]) -> None:
         np.testing.assert_allclose(values, wanted, rtol=0.0, atol=1e-13)
         turned = np.einsum("pj,ij,pi->p", basis(y, COLUMNS, by_y), c, basis(x, ROWS, by_x))
         assert np.abs(values - turned).max() > 0.1  # the axes the other way round
+
+
+@nb.njit
+def row_values(psf: Any, t0: Any, ramp: Any, work: Any) -> Any:
+    places = new_places(psf, ramp.size)
+    find_places(psf, (t0, ramp, ramp.size), work, (0, 0), places)
+    return places[3][: ramp.size]
+
+
+@pytest.mark.parametrize("stride", [1, 3, 4])
+@pytest.mark.parametrize("drift", [0.0, 0.01, -0.3])
+def test_rows_of_pixels_are_scipys(stride: int, drift: float) -> None:
+    """However far points drift off the stride, beyond the grid's ends, and where cells meet."""
+    rng = np.random.default_rng(1)
+    c = np.zeros((31, 31))
+    c[4:-4, 4:-4] = rng.standard_normal((23, 23))
+    ramp, t0 = np.arange(24.0), -11.0
+    for a0 in (0.0, 0.3):
+        work = np.zeros((4, 3))
+        work[2] = a0, stride * (1.0 + drift), 0.01 * drift
+        work[3] = 0.5 - a0, 3.0 * drift, -0.02 * drift
+        t = t0 + ramp
+        x, y = (row[0] + t * (row[1] + t * row[2]) for row in work[2:])
+        found = row_values(spline_profile(1.0, c, 1.0, stride), t0, ramp, work)
+        by_x, by_y = basis(x, 31, 0), basis(y, 31, 0)
+        np.testing.assert_allclose(
+            found, np.einsum("pj,ji,pi->p", by_y, c, by_x), rtol=0.0, atol=1e-13
+        )
+        turned = np.einsum("pj,ij,pi->p", by_y, c, by_x)
+        assert np.abs(found - turned).max() > 0.1  # the axes the other way round

@@ -151,7 +151,7 @@ class ForwardModel:
             width if narrowest is None else width * narrowest / self.psf.sigma, beta
         )
         return Optics(
-            psf=profile_of(self.psf, self.sources.x, self.sources.y),
+            psf=profile_of(self.psf, self.sources.x, self.sources.y, self.detector.binning),
             x=self.sources.x,
             y=self.sources.y,
             f_powers=f[:, 2:].copy(),

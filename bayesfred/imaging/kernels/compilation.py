@@ -197,6 +197,15 @@ def inner(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return partial(_compiled, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
+def leaf(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function as `inner` does, but without counting references to arrays.
+
+    For loops over pixels, which neither make arrays nor return any, and call no function that does:
+    the counts would cost more than a short row.
+    """
+    return inner(_nrt=False, **options)
+
+
 def shared(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function as `inner` does, but once for all its callers.
 
@@ -208,7 +217,8 @@ def shared(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _compiled(function: Callable[..., Any], is_shared: bool = False, **options: Any) -> Any:
-    dispatcher = nb.njit(**options)(function)
+    # a function without the option would take it from the first that calls it
+    dispatcher = nb.njit(**{"_nrt": True} | options)(function)
     dispatcher._cache = _Cache(function, is_shared)
     return dispatcher
 

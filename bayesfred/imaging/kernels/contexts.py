@@ -94,6 +94,7 @@ class Layout(NamedTuple):
     footprints: Footprints
     sigma: float  # the PSF's width, pixel
     work: Floats  # a row's polynomials: of p, D, a, b, a_v, b_v, and one to spare
+    places: Any  # room for what a PSF looks up, see `psf_dispatch`
 
 
 class Canvas(NamedTuple):

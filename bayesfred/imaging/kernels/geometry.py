@@ -29,6 +29,7 @@ from bayesfred.imaging.kernels.contexts import (
 )
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.polynomials import evaluate, multiply, shift
+from bayesfred.imaging.kernels.psf_dispatch import new_places
 
 CORE = 2.0  # widths of the PSF about a source's image within which its map must not fold
 SCATTER = 6.0  # standard deviations by which positions that scatter may move
@@ -325,9 +326,15 @@ def row_starts(fp, pitch):
 
 
 @inner()
+def layout_of(o, geometry, fp, sigma):
+    """The sources as they lie on the frame, their footprints known."""
+    return Layout(o, geometry, fp, sigma, new_work(o), new_places(o.psf, o.ramp.size))
+
+
+@inner()
 def lay_out(o, geometry, sigma):
     """The sources as they lie on the frame once they are located."""
-    return Layout(o, geometry, find_footprints(o, geometry), sigma, new_work(o))
+    return layout_of(o, geometry, find_footprints(o, geometry), sigma)
 
 
 @entry()

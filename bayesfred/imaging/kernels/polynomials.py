@@ -5,11 +5,11 @@ length of a tuple, that is as a compile-time constant, so that the loop over pix
 every degree.
 """
 
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import leaf
 from bayesfred.imaging.kernels.fastmath import FAST
 
 
-@inner(fastmath={"contract"})
+@leaf(fastmath={"contract"})
 def evaluate(c, u, v, degree):
     """The polynomial c and its derivatives with respect to u and v."""
     top = len(degree)
@@ -26,7 +26,7 @@ def evaluate(c, u, v, degree):
     return value, c_u, c_v
 
 
-@inner()
+@leaf()
 def shift(c, h, k, degree):
     """c(u, v) -> c(u + h, v + k) in place, by repeated synthetic division."""
     top = len(degree)
@@ -40,7 +40,7 @@ def shift(c, h, k, degree):
                 c[m, n] += k * c[m, n + 1]
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def multiply(a, b, conserve, q, d):
     """Coefficients of a^2 + b^2, and of a_u b_v - a_v b_u if flux is conserved, else of 1."""
     q[:] = 0.0
@@ -56,7 +56,7 @@ def multiply(a, b, conserve, q, d):
                         d[n + j - 1, m + i - 1] += (m * j - n * i) * a[m, n] * b[i, j]
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def map_on_row(source, w, work, degree):
     """Fill work[2:6] with a, b, a_v and b_v in powers of t = u - u_peak at v = v_peak + w."""
     a, b = source.a, source.b
@@ -72,7 +72,7 @@ def map_on_row(source, w, work, degree):
         ra[m], rb[m], rav[m], rbv[m] = pa, pb, pav, pbv
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def polynomial_on_row(c, w, factor, out, degree):
     """Coefficients in t of factor times the polynomial with coefficients c[n, m] of w^n t^m."""
     top = len(degree)

@@ -21,9 +21,10 @@ One that is a product, p = f(a) f(b), is faster where the map is a translation w
 One that has to look something up does so for all pixels of a row at once, and needs no `value`:
 
     new_places(psf, width)              room for a row's places in the table
-    find_places(psf, t0, ramp, work, degree, places)
+    find_places(psf, pixels, work, degree, places)
                                         fill it: a and b are the polynomials work[2] and work[3]
-                                        of that degree in t = t0 + ramp[n]
+                                        of that degree in t = t0 + ramp[n], n < size, and `pixels`
+                                        are (t0, ramp, size)
     at_place(psf, places, n)            p in the row's pixel n
 
 A family that varies over the field has instead `of_source(psf, s)`: the compiled half of another
@@ -88,8 +89,16 @@ def _no_places(psf, width):
     return ()
 
 
-def _find_none(psf, t0, ramp, work, degree, places):
+def _find_none(psf, pixels, work, degree, places):
     pass
+
+
+def _band(psf):
+    return 32  # of a source: what they look up stays in the caches for the next
+
+
+def _every_row(psf):
+    return 1 << 60
 
 
 def _radial_on_row(psf, t, n, work, degrees, places):
@@ -116,6 +125,7 @@ def _plane_on_row(psf, t, n, work, degrees, places):
 fill_psf_row = by_type(lambda family: _fill_radial if hasattr(family, "radial") else _fill_plane)
 new_places = by_type(lambda family: getattr(family, "new_places", _no_places))
 find_places = by_type(lambda family: getattr(family, "find_places", _find_none))
+rows_at_once = by_type(lambda family: _band if hasattr(family, "find_places") else _every_row)
 _at_place = by_type(lambda family: family.at_place)
 
 

@@ -4,7 +4,7 @@ On a row of pixels a^2 + b^2 and D are polynomials in u alone: a sample of a Gau
 two Horner sweeps and one exponential.
 """
 
-from bayesfred.imaging.kernels.compilation import entry, shared
+from bayesfred.imaging.kernels.compilation import entry, leaf, shared
 from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import (
@@ -24,37 +24,29 @@ from bayesfred.imaging.kernels.products import (
 from bayesfred.imaging.kernels.psf_dispatch import (
     fill_psf_row,
     find_places,
-    new_places,
     psf_of_source,
     psf_on_row,
     psf_slopes,
+    rows_at_once,
 )
 
 # sources whose rows are listed at a time: of many sources the list would outgrow the caches
 BATCH = 32
 
 
-@shared(fastmath=FAST, error_model="numpy")
-def add_source(layout, s, rows, flux, canvas, alone):
-    """Add the rows of source s from rows[0] to rows[1], times its flux, to a canvas.
-
-    `alone` is None or a canvas where the source alone is left.
-    """
+@leaf(fastmath=FAST, error_model="numpy")
+def _add_rows(layout, source, psf, rows_and_flux, canvas, alone):
+    """Do what `add_source` does where there is no product."""
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this
     # function: a call costs more than a short row.
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
-    lines = lines_of(o.translates, o.psf, layout, s, rows[0], rows[1])
-    if add_product(lines, fp, rows, flux, canvas, alone):
-        return
-    source = one_source(layout.geometry, s)
+    (rows, flux), places = rows_and_flux, layout.places
     d, u, v = source.d, source.u, source.v
     offsets, weights, step = o.offsets, o.weights, o.step
     lows, js, sizes = fp.low, fp.row, fp.size
     out, at = canvas.image, canvas.at
     middle_u, middle_v = 0.5 * (o.nx - 1), 0.5 * (o.ny - 1)
-    rd, ramp = work[1], o.ramp
-    psf = psf_of_source(o.psf, source.number)
-    degrees, places = o.degrees, new_places(psf, ramp.size)
+    rd, ramp, degrees = work[1], o.ramp, o.degrees
     d_top = len(degrees.d)
     norm = flux * psf.norm / (sigma * sigma)
     for i in range(rows[0], rows[1]):
@@ -67,7 +59,7 @@ def add_source(layout, s, rows, flux, canvas, alone):
             for x in range(offsets.size):
                 polynomial_on_row(d, w + offsets[y], norm * weights[y] * weights[x], rd, degrees.d)
                 t0 = t_low + offsets[x]
-                find_places(psf, t0, ramp[: row.size], work, degrees.ab, places)
+                find_places(psf, (t0, ramp, row.size), work, degrees.ab, places)
                 for n in range(row.size):
                     t = t0 + ramp[n]
                     j = rd[d_top]
@@ -77,6 +69,21 @@ def add_source(layout, s, rows, flux, canvas, alone):
                     row[n] += value
                     if alone is not None:
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)
+
+
+@shared(fastmath=FAST, error_model="numpy")
+def add_source(layout, s, rows, flux, canvas, alone):
+    """Add the rows of source s from rows[0] to rows[1], times its flux, to a canvas.
+
+    `alone` is None or a canvas where the source alone is left.
+    """
+    o, fp = layout.optics, layout.footprints
+    lines = lines_of(o.translates, o.psf, layout, s, rows[0], rows[1])
+    if add_product(lines, fp, rows, flux, canvas, alone):
+        return
+    source = one_source(layout.geometry, s)
+    psf = psf_of_source(o.psf, source.number)
+    _add_rows(layout, source, psf, (rows, flux), canvas, alone)
 
 
 @shared(fastmath=FAST, error_model="numpy")
@@ -125,6 +132,24 @@ def add_templates(layout, s, flux, stamps, wider):
                         row_s[n] += flux * (inverse * (a * k_a + b * k_b) - 2.0 * k) * abs(j)
 
 
+@shared()
+def add_sources(layout, flux, canvas):
+    """Add sources to a canvas, some rows of each at a time.
+
+    So what these look up of a PSF is in the caches after the first source.
+    """
+    first, top, is_done = layout.footprints.first, 0, False
+    band = rows_at_once(layout.optics.psf)
+    while not is_done:
+        is_done = True
+        for s in range(flux.size):
+            rows = first[s] + top, min(first[s] + top + band, first[s + 1])
+            if rows[0] < rows[1]:
+                add_source(layout, s, rows, flux[s], canvas, None)
+                is_done = is_done and rows[1] == first[s + 1]
+        top += band
+
+
 @entry()
 def render(o, theta, nuisances, flux, out):
     """Add all sources to the padded, flattened image `out`; False where a source's map folds."""
@@ -135,6 +160,5 @@ def render(o, theta, nuisances, flux, out):
         layout = lay_out(o, part, nuisances.psf_sigma)
         fp = layout.footprints
         canvas = Canvas(out, row_starts(fp, out.size // o.ny))
-        for i in range(part.peak.shape[0]):
-            add_source(layout, i, (fp.first[i], fp.first[i + 1]), flux[s + i], canvas, None)
+        add_sources(layout, flux[s : s + BATCH], canvas)
     return unfolded

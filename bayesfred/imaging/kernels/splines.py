@@ -1,4 +1,4 @@
-"""Cubic splines on a square grid, with four coefficients in one SIMD register.
+"""Cubic splines on a square grid, at one point or in eight pixels of a row.
 
 At a point of cell (j, i), where y and x of it have been passed, a spline is
 
@@ -10,6 +10,12 @@ sixteen coefficients one after the other, which takes twice as long. So the sum 
 instructions. The coefficients l = 0 ... 3 of a row lie side by side in memory and in a vector. Each
 of the four B_k(y) multiplies such a vector, and their sum is multiplied by the vector B(x) in the
 end.
+
+Eight pixels of a row take less than two points. From pixel to pixel a point moves by about `stride`
+coefficients along x and stays in its row of cells. So c[j + k, i + l] of all eight are in one SIMD
+register if every `stride`-th coefficient of a row, a phase, lies side by side in memory. Where the
+points drift off, by distortion, `run_length` says how many of the eight are right, and the next
+eight begin with the first that is not.
 """
 
 from collections.abc import Sequence
@@ -21,6 +27,9 @@ from llvmlite import ir
 from numba.extending import intrinsic
 
 from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.contexts import LANES
+
+BITS = 12  # a cell's number is that of its row, times 2^BITS, plus that of its column
 
 # of B_0 ... B_3, a row for each power of what is passed of the cell
 VALUE = (
@@ -115,12 +124,93 @@ def _sums(*wanted: tuple[Sequence[Sequence[float]], Sequence[Sequence[float]]]) 
     return intrinsic(sums)
 
 
-# (s,), (s, s_x, s_y) and (s_x, s_y, s_xx, s_xy, s_yy) of a spline s, by samples
-spline_value = _sums((VALUE, VALUE))
+# (s, s_x, s_y) and (s_x, s_y, s_xx, s_xy, s_yy) of a spline s, by samples
 spline_slopes = _sums((VALUE, VALUE), (VALUE, SLOPE), (SLOPE, VALUE))
 spline_second_derivatives = _sums(
     (VALUE, SLOPE), (SLOPE, VALUE), (VALUE, CURVE), (SLOPE, SLOPE), (CURVE, VALUE)
 )
+
+
+EIGHT = ir.VectorType(ir.DoubleType(), LANES)
+EIGHT_INTEGERS = ir.VectorType(ir.IntType(64), LANES)
+
+
+def _eight(context: Any, builder: Any, kind: Any, array: Any, n: Any, vector: Any) -> Any:
+    """Where an array's numbers n ... n + 7 are."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [n]), vector.as_pointer())
+
+
+def _bases(builder: Any, x: Any, table: Sequence[Sequence[float]]) -> list[Any]:
+    """B_0 ... B_3 at eight points, or derivatives of them."""
+    out = []
+    for powers in zip(*table, strict=True):
+        *lower, value = (ir.Constant(EIGHT, [c] * LANES) for c in powers)
+        for c in reversed(lower):
+            value = _times_plus(builder, value, x, c)
+        out.append(value)
+    return out
+
+
+@intrinsic
+def eight_values(typingctx: Any, c: Any, places: Any, passed: Any, n: Any, out: Any) -> Any:
+    """out[n], ..., out[n + 7]: the spline in eight pixels.
+
+    `places` are (columns, pitch): their first coefficients are c[columns[l]], ..., c[columns[l] +
+    7], and the rows of coefficients are `pitch` apart. What has been passed of the cells is y[n],
+    ... and x[n], ... of the two arrays `passed`.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kinds = signature.args
+        data = context.make_array(kinds[0])(context, builder, args[0]).data
+        columns, pitch = (builder.extract_value(args[1], k) for k in range(2))
+        across, along = (
+            _bases(builder, builder.load(_eight(*way, args[3], EIGHT), align=8), VALUE)
+            for way in (
+                (context, builder, kinds[2][k], builder.extract_value(args[2], k)) for k in range(2)
+            )
+        )
+        firsts = [builder.extract_value(columns, k) for k in range(4)]
+        total = ir.Constant(EIGHT, [0.0] * LANES)
+        for by_y in across:
+            row = ir.Constant(EIGHT, [0.0] * LANES)
+            for k, by_x in enumerate(along):
+                at = builder.bitcast(builder.gep(data, [firsts[k]]), EIGHT.as_pointer())
+                row = _times_plus(builder, builder.load(at, align=8), by_x, row)
+                firsts[k] = builder.add(firsts[k], pitch)
+            total = _times_plus(builder, row, by_y, total)
+        builder.store(total, _eight(context, builder, kinds[4], args[4], args[3], EIGHT), align=8)
+        return context.get_dummy_value()
+
+    return nb.types.void(c, places, passed, n, out), codegen
+
+
+@intrinsic
+def run_length(typingctx: Any, at: Any, n: Any, stride: Any) -> Any:
+    """How many of at[n], ..., at[n + 7] are at[n], at[n] + stride, at[n] + 2 stride, ..."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        at, n, stride = args
+        place = _eight(context, builder, signature.args[0], at, n, EIGHT_INTEGERS)
+        found = builder.load(place, align=8)
+        nothing = ir.Constant(EIGHT_INTEGERS, ir.Undefined)
+        zero, zeros = (
+            ir.Constant(ir.IntType(32), 0),
+            ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES),
+        )
+        first = builder.shuffle_vector(found, nothing, zeros)
+        step = builder.insert_element(nothing, stride, zero)
+        steps = builder.mul(
+            builder.shuffle_vector(step, nothing, zeros),
+            ir.Constant(EIGHT_INTEGERS, list(range(LANES))),
+        )
+        differs = builder.icmp_signed("!=", found, builder.add(first, steps))
+        bits = builder.zext(builder.bitcast(differs, ir.IntType(LANES)), ir.IntType(64))
+        bits = builder.or_(bits, ir.Constant(ir.IntType(64), 1 << LANES))
+        return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
+
+    return nb.types.int64(at, n, stride), codegen
 
 
 @inner(inline="always")

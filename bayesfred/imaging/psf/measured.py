@@ -13,7 +13,11 @@ from scipy import ndimage
 from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf.gaussian import GaussianPSF
-from bayesfred.imaging.psf.sampled import MARGIN, MOST_SAMPLES, FieldProfile, SplineProfile
+from bayesfred.imaging.psf.sampled import (
+    MARGIN,
+    MOST_SAMPLES,
+    spline_profile,
+)
 from bayesfred.io import psf_images
 from bayesfred.io.serialize import serializable
 
@@ -182,20 +186,20 @@ class MeasuredPSF:
         return self.sigma, 3.0
 
     @property
-    def profile(self) -> SplineProfile:
+    def profile(self) -> Any:
         """The PSF at the field's middle as the compiled loops need it."""
         scale = self.oversampling * self.sigma
         spline = np.pad(self.coefficients[0], MARGIN) / self.oversampling**2
-        return SplineProfile(scale**2, spline, scale)
+        return spline_profile(scale**2, spline, scale, round(self.oversampling))
 
-    def profile_of(self, x: Floats, y: Floats) -> SplineProfile | FieldProfile:
+    def profile_of(self, x: Floats, y: Floats) -> Any:
         """The PSF of every source as the compiled loops need it."""
         one = self.profile
         if self.degree == 0:
             return one
         c = np.tensordot(self.terms(x, y), self.coefficients, 1) / self.oversampling**2
         edges = [(0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)]
-        return FieldProfile(one.norm, np.pad(c, edges), one.scale)
+        return spline_profile(one.norm, np.pad(c, edges), one.scale, one.stride)
 
     def terms(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
         """The polynomial's terms at positions on the field (pixel), shape (n, terms)."""

@@ -60,10 +60,13 @@ def has_pixel(psf: PSF) -> bool:
     return bool(getattr(psf, "has_pixel", False))
 
 
-def profile_of(psf: PSF, x: Floats, y: Floats) -> Any:
+def profile_of(psf: PSF, x: Floats, y: Floats, binning: int) -> Any:
     """The compiled half of a PSF for sources at these positions, shape (s,), pixel."""
     varying = getattr(psf, "profile_of", None)
-    return psf.profile if varying is None else varying(x, y)
+    if varying is not None:
+        return varying(x, y)
+    binned = getattr(psf, "binned_profile", None)
+    return psf.profile if binned is None else binned(binning)
 
 
 def density_at(

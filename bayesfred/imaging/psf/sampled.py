@@ -11,22 +11,35 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, ndimage, special
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
+from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.contexts import LANES
 from bayesfred.imaging.kernels.splines import (
+    BITS,
+    eight_values,
+    run_length,
     spline_cell,
     spline_second_derivatives,
     spline_slopes,
-    spline_value,
 )
 from bayesfred.io.serialize import serializable
 
 MOST_SAMPLES = 1001  # a side
+OUTSIDE = 1 << 40  # more than any cell's number
+CLOSE = 2.0**-20  # what is this far before a cell is taken for in it: rounding must not part pixels
 MARGIN = 4  # zeros around a spline's coefficients
 
 
+@inner()
+def new_spline_places(width):
+    """Cells, what is passed of them along y and x, and values, see `SplineProfile.find_places`."""
+    size = width + LANES  # the last pixels are made together with what lies behind them
+    return np.empty(size, np.int64), np.empty(size), np.empty(size), np.empty(size)
+
+
 class SplineProfile(NamedTuple):
-    """norm times a cubic spline, see `imaging/kernels/psf_dispatch`.
+    """norm times a cubic spline, see `imaging/kernels/psf_dispatch` and `imaging/kernels/splines`.
 
     The spline is the sum of c[j, i] B(y - j) B(x - i), with B the cubic B-spline and (x, y) =
     scale (a, b) counted from the middle of c. The four outermost rows and columns of c are zero.
@@ -34,6 +47,9 @@ class SplineProfile(NamedTuple):
 
     norm: float
     c: Floats
+    phases: Floats  # the same coefficients as `eight_values` needs them
+    columns: Ints  # where those of the first row are among them
+    stride: int  # samples from pixel to pixel
     scale: float  # samples per width
 
     @staticmethod
@@ -54,30 +70,70 @@ class SplineProfile(NamedTuple):
 
     @staticmethod
     def new_places(psf: Any, width: Any) -> Any:
-        return np.empty(width, np.int64), np.empty(width), np.empty(width)
+        return new_spline_places(width)
 
     @staticmethod
-    def find_places(psf: Any, t0: Any, ramp: Any, work: Any, degree: Any, places: Any) -> Any:
+    def find_places(psf: Any, pixels: Any, work: Any, degree: Any, places: Any) -> Any:
         # two loops: one would have more arrays than a compiler tells apart, and be no SIMD loop
-        at, y, x = places
-        a, b, c, scale, top = work[2], work[3], psf.c, psf.scale, len(degree)
-        for n in range(ramp.size):
+        (t0, ramp, size), (at, y, x, p) = pixels, places
+        a, b, top, width = work[2], work[3], len(degree), psf.columns.size
+        c, columns, stride, scale = psf.phases, psf.columns, psf.stride, psf.scale
+        pitch, far = -(-width // stride) * stride, 0.5 * (width - 1) - 1.5
+        for n in range(size):
             t = t0 + ramp[n]
             z = b[top]
             for m in range(top):
                 z = z * t + b[top - 1 - m]
-            at[n], y[n] = spline_cell(c.shape[0], scale * z)
-        for n in range(ramp.size):
+            j, passed = spline_cell(psf.c.shape[0], scale * z + CLOSE)
+            at[n], y[n] = j << BITS, passed - CLOSE
+        for n in range(size):
             t = t0 + ramp[n]
             z = a[top]
             for m in range(top):
                 z = z * t + a[top - 1 - m]
-            i, x[n] = spline_cell(c.shape[1], scale * z)
-            at[n] = at[n] * c.shape[1] + i
+            i, passed = spline_cell(width, scale * z + CLOSE)
+            x[n] = passed - CLOSE
+            at[n] = at[n] + i if abs(scale * z) < far else stride * n - OUTSIDE
+        n = 0
+        while n < size:
+            cell = max(at[n], 0)
+            i, begin = cell & (1 << BITS) - 1, (cell >> BITS) * pitch
+            first = begin + columns[i], begin + columns[i + 1]
+            second = begin + columns[i + 2], begin + columns[i + 3]
+            eight_values(c, ((*first, *second), pitch), (y, x), n, p)
+            n += run_length(at, n, stride)
 
     @staticmethod
     def at_place(psf: Any, places: Any, n: Any) -> Any:
-        return spline_value(psf.c, places[0][n], places[1][n], places[2][n])[0]
+        return places[3][n]
+
+
+def spline_profile(norm: float, c: Floats, scale: float, stride: int) -> Any:
+    """The compiled half of a PSF, or of one for every source.
+
+    Parameters
+    ----------
+    norm : float
+        This and the others as in `SplineProfile`.
+    c : ndarray, shape (n, n) or (s, n, n)
+    scale : float
+    stride : int
+
+    Returns
+    -------
+    SplineProfile or FieldProfile
+    """
+    beside = min(LANES * stride, MOST_SAMPLES)  # zeros, so that a row ends with whole vectors
+    wide = np.pad(c, [(0, 0)] * (c.ndim - 1) + [(beside, beside)])
+    n = wide.shape[-1]
+    among = -(-n // stride)  # coefficients of a phase in a row
+    columns = np.arange(n) % stride * among + np.arange(n) // stride
+    rows = np.zeros((*c.shape[:-1], stride * among))
+    rows[..., columns] = wide
+    every = rows.reshape(*c.shape[:-2], -1)
+    padded = np.pad(every, [(0, 0)] * (c.ndim - 2) + [(0, LANES)])
+    family = SplineProfile if c.ndim == 2 else FieldProfile
+    return family(norm, c, padded, columns, stride, scale)
 
 
 class FieldProfile(NamedTuple):
@@ -85,11 +141,19 @@ class FieldProfile(NamedTuple):
 
     norm: float
     c: Floats  # (s, n, n)
+    phases: Floats  # (s, coefficients)
+    columns: Ints
+    stride: int
     scale: float
 
     @staticmethod
+    def new_places(psf: Any, width: Any) -> Any:
+        return new_spline_places(width)
+
+    @staticmethod
     def of_source(psf: Any, s: Any) -> Any:
-        return SplineProfile(psf.norm, psf.c[s], psf.scale)
+        norm, c, phases, columns, stride, scale = psf
+        return SplineProfile(norm, c[s], phases[s], columns, stride, scale)
 
 
 @serializable("psf.sampled")
@@ -284,10 +348,14 @@ class SampledPSF:
         return self.sigma, 3.0
 
     @property
-    def profile(self) -> SplineProfile:
+    def profile(self) -> Any:
         """The PSF of unit width as the compiled loops need it."""
-        scale = self.oversampling * self.sigma
-        return SplineProfile(scale**2, self._spline, scale)
+        return self.binned_profile(1)
+
+    def binned_profile(self, binning: int) -> Any:
+        """The same where a recorded pixel is this many pixels wide."""
+        scale, stride = self.oversampling * self.sigma, round(self.oversampling * binning)
+        return spline_profile(scale**2, self._spline, scale, stride)
 
     def support_radius(self, tolerance: float) -> float:
         """Distance from the middle beyond which p is below `tolerance` times its peak, pixel.

@@ -8,7 +8,7 @@ from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import take_turn
 from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, row_starts
-from bayesfred.imaging.kernels.render import add_source
+from bayesfred.imaging.kernels.render import add_sources
 from bayesfred.model.kernels.clusters import bounding_boxes, find_clusters
 from bayesfred.model.kernels.contexts import Profiled, Rendered, Touching, parameters_of
 from bayesfred.model.kernels.extrapolate import profile_extrapolated
@@ -27,7 +27,7 @@ def _fill_fluxes(problem, layout, w, parameters, fluxes, free):
         canvas = Canvas(w.image, row_starts(fp, w.image.size // o.ny))
         for s in range(fluxes.size):
             fluxes[s] = parameters.nuisances.flux_scale * problem.flux[s]
-            add_source(layout, s, (fp.first[s], fp.first[s + 1]), fluxes[s], canvas, None)
+        add_sources(layout, fluxes, canvas)
         return 0.0, None
     templates = 3 if parameters.nuisances.position_scatter > 0.0 else 1
     boxes = bounding_boxes(fp)

@@ -7,8 +7,8 @@ import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
-from bayesfred.imaging.kernels.contexts import SEGMENT, Layout
-from bayesfred.imaging.kernels.geometry import new_work, row_starts
+from bayesfred.imaging.kernels.contexts import SEGMENT
+from bayesfred.imaging.kernels.geometry import layout_of, row_starts
 from bayesfred.imaging.kernels.jacobian import add_jacobian_rows
 from bayesfred.model.kernels.clusters import (
     DOF,
@@ -189,7 +189,7 @@ def fisher(problem, w, rendered, parameters, basis, out):
     profiled, scatter = rendered.profiled, parameters.nuisances.position_scatter
     known_error = _fill_weight(frame, noise, w, background)
     sigma = parameters.nuisances.psf_sigma
-    layout = Layout(o, rendered.geometry, rendered.footprints, sigma, new_work(o))
+    layout = layout_of(o, rendered.geometry, rendered.footprints, sigma)
     sources, size = basis.row.size, out.shape[0]
     cross = np.zeros((rendered.fluxes.size * (3 if scatter > 0.0 else 1), size))
     jacobian = np.empty((size, BAND, w.image.size // o.ny))

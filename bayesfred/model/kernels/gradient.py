@@ -43,7 +43,7 @@ import numpy as np
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Layout
-from bayesfred.imaging.kernels.geometry import new_work, row_starts
+from bayesfred.imaging.kernels.geometry import layout_of, row_starts
 from bayesfred.imaging.kernels.jacobian import Rows, new_rows, second_derivatives
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.clusters import (
@@ -366,7 +366,7 @@ def gradient(problem, w, rendered, parameters, basis, out):
     if not rendered.extra + value > -math.inf:
         return (math.nan, math.nan), np.empty((0, 0))
     fp, pitch = rendered.footprints, w.image.size // o.ny
-    layout = Layout(o, rendered.geometry, fp, parameters.nuisances.psf_sigma, new_work(o))
+    layout = layout_of(o, rendered.geometry, fp, parameters.nuisances.psf_sigma)
     wanted = _wanted(rendered.profiled, w)
     weigh_rows(frame, noise, w, (background, (0, o.ny)), wanted[0], wanted[1])
     scatter = parameters.nuisances.position_scatter
