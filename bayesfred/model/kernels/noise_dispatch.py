@@ -42,7 +42,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, leaf
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.psf_dispatch import by_type
 from bayesfred.model.kernels.contexts import LIMIT, STRETCH
@@ -70,7 +70,7 @@ information = by_type(lambda family: family.information)
 unreached = _optional("unreached", _no_pixels)
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def sum_pixels(noise, values, light, image, level, first):
     """Sum of the log-densities of the unmasked pixels of a stretch, one by one."""
     total = 0.0
@@ -116,7 +116,7 @@ error_information = _optional("error_information", _no_information)
 level_derivatives = _optional("level_derivatives", _no_derivatives)
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _fill_means(image, level, response, out):
     for i in range(out.size):
         out[i] = (image[i] + level) * response[i]

@@ -12,7 +12,7 @@ from typing import Any
 from numba import types
 from numba.extending import overload
 
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log
 from bayesfred.model.kernels.contexts import LIMIT, MASKED, STRETCH
@@ -30,7 +30,7 @@ from bayesfred.model.kernels.poisson_gaussian import (
 )
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def _find_cells(table, values, image, level, cells, places):
     """The cells of a stretch's pixels in the table of g, and the sum of -mu."""
     total = 0.0
@@ -43,7 +43,7 @@ def _find_cells(table, values, image, level, cells, places):
     return total
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _sum_cells(table, cells, places):
     """Sum of g; without leave to reassociate, so that it is not made to gather.
 
@@ -60,7 +60,7 @@ def _sum_cells(table, cells, places):
     return (a + b) + (c + d)
 
 
-@inner()
+@leaf()
 def _sum_tabulated(table, values, image, level, scratch):
     cells, places, total = scratch[0], scratch[1], 0.0
     for a in range(0, image.size, STRETCH):
@@ -71,7 +71,7 @@ def _sum_tabulated(table, values, image, level, scratch):
     return total
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _sum(x):
     total = 0.0
     for i in range(x.size):
@@ -79,7 +79,7 @@ def _sum(x):
     return total
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def _sum_densities(kind, variance, values, image, level):
     """The sum from the formulas, one pixel after another."""
     total = 0.0
@@ -92,7 +92,7 @@ def _sum_densities(kind, variance, values, image, level):
     return total
 
 
-@inner()
+@leaf()
 def _sum_segments(table, noise, values, image, level, place):
     """The sum from the table, or from the formulas where it does not serve."""
     (kind, variance), (first, scratch), total, k = noise, place, 0.0, 0
@@ -114,20 +114,20 @@ def _sum_segments(table, noise, values, image, level, place):
     return total
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _find_x(variance, values, image, level, x, q):
     for i in range(image.size):
         q[i] = 1.0 / variance[i]
         x[i] = rough_x(values[i], max(image[i] + level, TINY), q[i])
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _guess_omega(x, w):
     for i in range(x.size):
         w[i] = rougher_omega(x[i])
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _find_tilt(values, x, w, q):
     """The tilts s in place of x, and 1 / (y + r^2) roughly in place of 1 / r^2."""
     for i in range(x.size):
@@ -136,13 +136,13 @@ def _find_tilt(values, x, w, q):
         q[i] *= known
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _find_means(image, level, s, y):
     for i in range(s.size):
         y[i] = tilted_mean(max(image[i] + level, TINY), s[i])
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def _sum_tilted(variance, values, image, level, rough):
     """The sum of log p without log phi, and 1 / (y + r^2) in place of its rough value."""
     (s, y, q), total = rough, 0.0
@@ -155,7 +155,7 @@ def _sum_tilted(variance, values, image, level, rough):
     return total
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def _sum_corrections(variance, values, q):
     total = 0.0
     for i in range(q.size):
@@ -164,7 +164,7 @@ def _sum_corrections(variance, values, q):
     return total
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def _sum_logs(q):
     quarter, total = q.size // 4, 0.0
     for i in range(quarter):
@@ -173,7 +173,7 @@ def _sum_logs(q):
     return total
 
 
-@inner()
+@leaf()
 def _sum_expansion(variance, values, image, level, scratch):
     """The sum of the saddlepoint expansion over pixels that differ in their read noise."""
     total = 0.0
