@@ -49,6 +49,7 @@ from bayesfred.sampling.moves import LaplaceMove
 __all__ = ["Evidence", "importance_evidence", "log_evidence", "random_numbers"]
 
 PROPOSALS = 1000
+PARTS = 4  # of the draws, after which their error may be small enough
 COARSE = 0.3  # error above which a few draws decide
 EVEN = 5.0  # largest weight over their mean: the shape of such a tail is noise, and no matter
 STREAM = 20  # apart from the random numbers that made the chain
@@ -117,7 +118,8 @@ def log_evidence(chain: Chain) -> Evidence:
         draws = chain.chain[:, chain.burn_in :].reshape(-1, len(chain.parameter_names))
         log_q = move.log_density(draws).reshape(kept.shape)
         walkers = (kept - log_q).transpose(0, 2, 1).reshape(-1, kept.shape[1])
-        return _bridge(walkers, _proposed(density, move, chain.estimate, PROPOSALS, random))
+        near = density.near(chain.estimate.params, chain.estimate.covariance)
+        return _bridge(walkers, _proposed(near, move, PROPOSALS, random))
 
 
 def importance_evidence(
@@ -125,6 +127,7 @@ def importance_evidence(
     top: MapEstimate,
     number: int,
     random: np.random.RandomState,
+    enough: float = 0.0,
 ) -> tuple[Evidence, float]:
     """The evidence by importance sampling from the proposal at a maximum.
 
@@ -136,6 +139,8 @@ def importance_evidence(
     number : int
         Draws of the proposal.
     random : RandomState
+    enough : float
+        Error from which fewer do: after each quarter of them it is compared.
 
     Returns
     -------
@@ -154,9 +159,13 @@ def importance_evidence(
     ----------
     A. Vehtari et al. (2024), Journal of Machine Learning Research 25, 72: the shape and its limit.
     """
-    ratios = _proposed(density, LaplaceMove.of(density, top), top, number, random)
-    weights = np.exp(ratios - ratios.max())
-    error = float(np.std(weights, ddof=1) / np.mean(weights) / math.sqrt(number))
+    move, near = LaplaceMove.of(density, top), density.near(top.params, top.covariance)
+    ratios, error = np.empty(0), np.inf
+    while ratios.size < number and not error <= enough:
+        some = -(-number // PARTS) if enough else number
+        ratios = np.append(ratios, _proposed(near, move, some, random))
+        weights = np.exp(ratios - ratios.max())
+        error = float(np.std(weights, ddof=1) / np.mean(weights) / math.sqrt(ratios.size))
     if error > COARSE:
         shape = np.inf
     elif weights.max() <= EVEN * weights.mean():
@@ -164,7 +173,7 @@ def importance_evidence(
     else:
         with np.errstate(all="ignore"):  # of weights that are zero
             shape = float(array_stats.psislw(-ratios)[1])
-    return Evidence(float(logsumexp(ratios) - math.log(number)), error), shape
+    return Evidence(float(logsumexp(ratios) - math.log(ratios.size)), error), shape
 
 
 def random_numbers(chain: Chain) -> np.random.RandomState:
@@ -175,13 +184,12 @@ def random_numbers(chain: Chain) -> np.random.RandomState:
 def _proposed(
     density: TargetDensity,
     move: LaplaceMove,
-    top: MapEstimate,
     number: int,
     random: np.random.RandomState,
 ) -> Floats:
     """Logarithms of posterior over proposal at draws of the proposal."""
     draws = move.draw(number, random)
-    values = density.near(top.params, top.covariance).log_prob(draws)
+    values = density.log_prob(draws)
     values = np.where(values < np.inf, values, -np.inf)  # as the sampler takes them
     if not np.any(values > -np.inf):
         raise InputError(f"estimate: {OUTSIDE}: see find_map")
