@@ -450,3 +450,32 @@ def test_coverage_with_a_psf_that_was_measured(fwhm):
     assert abs(np.mean(measured < 1.96) - 0.95) < 0.03
     if fwhm < 2.0:
         assert np.mean(gaussian < 1.0) < 0.6 and np.mean(gaussian < 1.96) < 0.88
+
+
+@pytest.mark.slow
+def test_strengths_to_begin_with_do_not_matter():
+    """Strengths that stopped on their way left PSFs 15 standard deviations apart."""
+    model = bf.ForwardModel(
+        bf.Detector((123, 123), pixel="box"), bf.SourceCatalog.grid(9, 13.7, 5e4),
+        bf.MoffatPSF(1.3, 3.0), bf.PolynomialDistortion.polynomial(2),
+    )  # fmt: skip
+    theta = 1e-5 * np.random.default_rng(2).standard_normal(model.distortion.n_terms)
+    posterior = bf.Posterior(
+        replace(model, psf=bf.GaussianPSF(0.55)), bf.simulate(model, theta, 5.0, seed=3),
+        nuisances=bf.Nuisances(flux="free", offset=True),
+    )  # fmt: skip
+    start = starting_state(posterior, bf.find_map(posterior), 4.0, 1)
+    found = [
+        solved(posterior, replace(start, strengths=np.full(len(start.strengths), strength)))
+        for strength in (1.0, 1e5)
+    ]
+    one, other = (
+        np.concatenate([each.state.deviations, each.state.params]) + each.step for each in found
+    )
+    upper, scale = found[0].factor
+    apart = upper @ ((one - other) / scale)
+    assert apart @ apart < 1.0  # squared standard deviations, of 350 numbers together
+    # negative control: another strength is another PSF
+    stronger = found[0].state.strengths * np.where(np.arange(3) == 0, 30.0, 1.0)
+    moved = replace(found[0], state=replace(found[0].state, strengths=stronger)).measured
+    assert moved @ moved > 1.0

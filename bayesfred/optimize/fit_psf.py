@@ -13,6 +13,7 @@ the distortion say where a source is). Both hold for the variation over the fiel
 """
 
 import math
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -26,16 +27,25 @@ from bayesfred.imaging.psf.measured import check_choices, field_terms
 from bayesfred.imaging.psf.sampled import spline_coefficients
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.threads import one_blas_thread
+from bayesfred.optimize.anderson import accelerated
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.psf_equations import WIDTH, PsfEquations, PsfState, field_radius
+from bayesfred.optimize.psf_equations import (
+    SECANTS,
+    STILL,
+    WIDTH,
+    PsfEquations,
+    PsfState,
+    field_radius,
+)
 from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
 from bayesfred.optimize.psf_samples import PsfSamples
 
 FULLY_SAMPLED = 1.5  # pixel: PSFs of a larger FWHM have fewer knots per pixel
 TURNS = 40
-CHOOSING = 8  # turns in which the counts choose the strengths of the prior
-EXACT = 4  # turns in which the model is taken to be exact
-STILL = 0.1  # squared standard deviations, of all unknowns together
+CHOOSING = 8  # turns of the strengths of the prior within one
+EXACT = 4  # turns in which the model is taken to be exact, at the most
+PATIENCE = 6  # turns without a nearer place after which an information leads no more
+FARTHER = 10.0  # than the nearest place: there it leads no more at all
 LARGEST = 0.4  # change of the PSF in one turn, share of its peak
 DARKEST = 0.1  # of its value that a flux may fall to in one turn
 DRAWS = 100
@@ -146,22 +156,20 @@ def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
     InputError
         If no solution is found.
     """
-    known, before, last, share = None, math.inf, None, 1.0
+    exact, close = True, False
     for turn in range(TURNS):
-        # a model error that came first would explain what a PSF too smooth leaves
-        equations = PsfEquations.of(posterior, state, exact=turn < EXACT, known=known)
-        if turn < CHOOSING:
-            equations = equations.with_strengths()
-        far = equations.along(equations.step)
-        if turn > EXACT and far < STILL and known is None:
+        equations = PsfEquations.of(posterior, state, exact=exact)
+        # strengths that are iterated until they rest are the same whatever the start
+        equations = equations.with_strengths(CHOOSING if close else 1)
+        far = _far(equations)
+        if far < STILL and not exact:
             return equations
-        # weights follow the light: where that turns a step back, a part of it goes farther
-        if last is not None:
-            share = min(1.0, share / max(1.0 - equations.along(last) / before, 0.5))
-        # information from a state nearby serves while it leads on, but not for the errors
-        leads = turn >= CHOOSING and STILL <= far < before
-        known, before, last = equations if leads else None, far, equations.step
-        state = _moved(posterior, equations, share)
+        close = far < equations.pull.size
+        if close and not exact:
+            equations = _followed(posterior, equations)
+        state = _moved(posterior, equations.state, _change(equations))
+        # a model error that came first would explain what a PSF too smooth leaves
+        exact = exact and not close and turn + 1 < EXACT
     raise InputError(
         f"psf: no PSF found in {TURNS} turns: expected a start that resembles it: fit the width "
         "first (nuisances: psf_sigma), or begin from another PSF"
@@ -212,30 +220,63 @@ def _pixel_density(psf: PSF, scale: float, pixel: float, x: Floats) -> Floats:
     return out
 
 
-def _moved(posterior: Posterior, equations: PsfEquations, share: float) -> PsfState:
-    """The state a share of a step on, or as much of it as leaves the PSF recognisable."""
-    state, step = equations.state, equations.step
-    size = state.deviations.size
-    change = state.grid.combined(np.concatenate([np.zeros(state.grid.fixed), step[:size]]))
+def _far(equations: PsfEquations) -> float:
+    """The step's squared length, in standard deviations of all unknowns together."""
+    return float(equations.measured @ equations.measured)
+
+
+def _followed(posterior: Posterior, equations: PsfEquations) -> PsfEquations:
+    """The equations where their information and strengths lead, or nearest to it.
+
+    Weights follow the light, and fluxes and positions the PSF: steps turn back or lag behind.
+    """
+    best, points, since = equations, deque[tuple[Floats, Floats, Floats]](maxlen=SECANTS), 0
+    while since < PATIENCE:
+        points.append((_place(equations.state), _change(equations), equations.measured))
+        state = _moved(posterior, equations.state, accelerated(points))
+        equations = PsfEquations.of(posterior, state, known=equations)
+        far = _far(equations)
+        since += 1
+        if far < _far(best):
+            best, since = equations, 0
+        if far < STILL or not far < FARTHER * _far(best):
+            break
+    return best
+
+
+def _place(state: PsfState) -> Floats:
+    """All that a step changes: deviations, parameters, fluxes and shifts."""
+    own = np.column_stack([state.fluxes, state.shifts])
+    return np.concatenate([state.deviations, state.params, own.ravel()])
+
+
+def _change(equations: PsfEquations) -> Floats:
+    """The step as a change of all these."""
+    information, step = equations.information, equations.step
+    own = np.zeros(3 * equations.state.fluxes.size)
+    own[information.which] = equations.own_step - information.response @ step
+    return np.concatenate([step, own])
+
+
+def _moved(posterior: Posterior, state: PsfState, change: Floats) -> PsfState:
+    """The state after a change, or as much of it as leaves the PSF recognisable."""
+    size, unknowns = state.deviations.size, state.deviations.size + state.params.size
+    wider = state.grid.combined(np.concatenate([np.zeros(state.grid.fixed), change[:size]]))
     peak = np.abs(state.grid.combined(state.coefficients)[0]).max()
     s = posterior.model.sources
     terms = field_terms(s.x, s.y, state.grid.degree, field_radius(posterior))
-    largest = float(np.abs(terms @ change.reshape(len(change), -1)).max())
-    share = min(share, LARGEST * peak / max(largest, 1e-300))
-    index, response = equations.information.which, equations.information.response
-    every = share * (equations.own_step - response @ step)
-    params = state.params + share * step[size:]
-    fluxes, shifts = state.fluxes.copy(), state.shifts.copy()
+    largest = float(np.abs(terms @ wider.reshape(len(wider), -1)).max())
+    change = change * min(1.0, LARGEST * peak / max(largest, 1e-300))
+    params, fluxes = state.params + change[size:unknowns], state.fluxes.copy()
+    own = change[unknowns:].reshape(-1, 3)
     names = posterior.parameter_names
     if "flux_scale" in names:
         k = names.index("flux_scale")
         params[k] = max(params[k], DARKEST * state.params[k])
         fluxes *= params[k] / state.params[k]
-    light = index % 3 == 0
-    at = index[light] // 3
-    fluxes[at] = np.maximum(fluxes[at] + every[light], DARKEST * fluxes[at])
-    shifts[index[~light] // 3, index[~light] % 3 - 1] += every[~light]
-    coefficients = state.deviating(state.deviations + share * step[:size])
+    fluxes = np.maximum(fluxes + own[:, 0], DARKEST * fluxes)
+    shifts = state.shifts + own[:, 1:]
+    coefficients = state.deviating(state.deviations + change[:size])
     return replace(state, coefficients=coefficients, params=params, fluxes=fluxes, shifts=shifts)
 
 

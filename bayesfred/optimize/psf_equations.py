@@ -8,6 +8,7 @@ noise a model error, a share of the light, is added to the variance.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
-from scipy.optimize import brentq
 from scipy.sparse.linalg import splu
 
 from bayesfred._typing import Floats, Ints
@@ -24,19 +24,25 @@ from bayesfred.imaging.psf.measured import field_terms
 from bayesfred.model import priors
 from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.anderson import accelerated
 from bayesfred.optimize.psf_levels import LIMITS, PsfGrid
 from bayesfred.optimize.psf_samples import (
+    OUTLYING,
     PsfSamples,
+    likely_error,
     source_columns,
     template_products,
     template_pulls,
 )
 
-OUTLYING = 6.0  # standard deviations beyond which a pixel counts less
 TOGETHER = 512  # rows of a matrix
 PROBES = 40  # draws from which the number of determined coefficients is estimated
 SEEN = 0.1  # of a source's light that its flux and place are found by, at the least
-FASTEST = 30.0  # factor by which a strength may change in a turn
+STILL = 0.1  # squared standard deviations, of all unknowns together, by which a solution is off
+FASTEST = 3.4  # logarithm of the factor by which a strength may change in a turn
+SECANTS = 6  # turns that accelerate the next
+RATES = (0.5, 5.0)  # times the evidence's own change that a strength goes
+LEAST_DETERMINED = 1e-2  # coefficients of a block
 SCATTER, WIDTH = "position_scatter", "psf_sigma"
 HELD = (SCATTER, WIDTH, "model_error")  # parameters that are not solved for here
 
@@ -260,36 +266,57 @@ class PsfEquations:
         target[0] += 1.0
         return self._constrained(self._solved(pull), target)
 
-    def along(self, other: Floats) -> float:
-        """The product of the step with another, in standard deviations of all unknowns together."""
+    @property
+    def measured(self) -> Floats:
+        """The step in standard deviations: the squares' sum is that of all unknowns together."""
         upper, scale = self.factor
-        return float((upper @ (self.step / scale)) @ (upper @ (other / scale)))
+        return np.asarray(upper @ (self.step / scale))
 
     def draws(self, number: int) -> Floats:
         """Draws from the posterior of all unknowns, less its maximum, a column each."""
+        return self._drawn(self._normal(number))
+
+    def _normal(self, number: int) -> Floats:
+        return np.random.default_rng(0).standard_normal((len(self.pull), number))
+
+    def _drawn(self, normal: Floats) -> Floats:
         upper, scale = self.factor
-        normal = np.random.default_rng(0).standard_normal((len(scale), number))
         free = scale[:, None] * linalg.solve_triangular(upper, normal, check_finite=False)
-        return self._constrained(free, np.zeros((len(self.conventions), number)))
+        return self._constrained(free, np.zeros((len(self.conventions), normal.shape[1])))
 
     def determined(self) -> Floats:
-        """How many coefficients of every block the counts determine."""
-        drawn, out = self.draws(PROBES), []
+        """How many coefficients of every block the counts determine, from a few draws."""
+        size = self.state.deviations.size
+        (upper, scale), normal = self.factor, self._normal(PROBES)
+        drawn, known, out = self._drawn(normal), (upper.T @ normal / scale[:, None])[:size], []
         for block, strength in zip(self.state.grid.blocks, self.state.strengths, strict=True):
-            own = drawn[: self.state.deviations.size][block.where]
-            spread = float(np.sum(own * (block.roughness @ own))) / PROBES
-            out.append(len(own) - strength * spread)
-        return np.maximum(out, 1.0)
+            own = drawn[:size][block.where]
+            # less the prior's part of the same draws, in whose noise little would be lost
+            prior = strength * (block.roughness @ own) + block.amplitude[:, None] * own
+            out.append(float(np.sum(own * (known[block.where] - prior))) / PROBES)
+        return np.maximum(out, LEAST_DETERMINED)
 
-    def with_strengths(self) -> "PsfEquations":
-        """The equations with the strengths that the evidence prefers."""
-        state = self.state
-        there = state.deviations + self.step[: state.deviations.size]
-        parts = [(there[block.where], block.roughness) for block in state.grid.blocks]
-        squares = np.array([own @ (roughness @ own) for own, roughness in parts])
-        best = self.determined() / np.maximum(squares, 1e-300)
-        best = np.clip(best, state.strengths / FASTEST, state.strengths * FASTEST)
-        return replace(self, state=replace(state, strengths=np.clip(best, *LIMITS)))
+    def with_strengths(self, turns: int) -> "PsfEquations":
+        """The equations with the strengths that the evidence prefers, or after a few turns."""
+        out, points = self, deque[tuple[Floats, Floats, Floats]](maxlen=SECANTS)
+        for _ in range(turns):
+            determined, state = out.determined(), out.state
+            there = state.deviations + out.step[: state.deviations.size]
+            parts = [(there[block.where], block.roughness) for block in state.grid.blocks]
+            squares = np.array([own @ (roughness @ own) for own, roughness in parts])
+            off = np.log(determined / np.maximum(state.strengths * squares, 1e-300))
+            off = np.clip(off, *np.log(np.divide.outer(LIMITS, state.strengths)))
+            off = np.clip(off, -FASTEST, FASTEST)
+            measured = np.sqrt(determined) * off  # by how much the solution would move
+            if float(measured @ measured) < STILL:
+                break
+            points.append((np.log(state.strengths), off, measured))
+            with np.errstate(invalid="ignore"):
+                rate = np.clip(np.nan_to_num(accelerated(points) / off, nan=1.0), *RATES)
+            change = np.clip(rate * off, -FASTEST, FASTEST)
+            strengths = np.clip(state.strengths * np.exp(change), *LIMITS)
+            out = replace(out, state=replace(state, strengths=strengths))
+        return out
 
 
 def shared_information(posterior: Posterior, state: PsfState, params: Floats) -> Floats:
@@ -350,7 +377,7 @@ def _pixels(
     templates = data.samples.size * np.stack([p[0], -bright * p[1], -bright * p[2]])
     light = data.image(bright * templates[0])
     residual, variance = data.residual(posterior, state.params, light)
-    error = _model_error(residual, variance, light) if error is None else error
+    error = likely_error(residual, variance, light) if error is None else error
     variance = variance + (error * light) ** 2
     weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * outlying**2)))
     return Pixels(data, terms, templates, weight, weight * residual, error)
@@ -369,17 +396,3 @@ def _shift_precision(posterior: Posterior, state: PsfState) -> Floats:
     if posterior.nuisances.position_scatter:
         out[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
     return out.ravel()
-
-
-def _model_error(residual: Floats, variance: Floats, light: Floats) -> float:
-    """The most likely share of the light by which the model is off; 0 if the noise explains all."""
-
-    def excess(error: float) -> float:
-        total = variance + (error * light) ** 2
-        z = np.minimum(residual**2 / total, OUTLYING**2)
-        return float(np.sum(light**2 / total * (z - 1.0)))
-
-    # the score of the squared error, in its standard deviations
-    if excess(0.0) < 3.0 * math.sqrt(2.0 * float(np.sum((light**2 / variance) ** 2))):
-        return 0.0
-    return float(brentq(excess, 0.0, 10.0, xtol=1e-4)) if excess(10.0) < 0.0 else 10.0

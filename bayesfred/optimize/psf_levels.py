@@ -30,7 +30,7 @@ from bayesfred.model.kernels.psf_normal import Levels, halved
 FIELD_RADIUS = 5.0  # of the grid for the variation over the field, widths of the PSF
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
 STRENGTH = 100.0  # to begin with
-LIMITS = (1e-3, 1e9)  # of a strength
+LIMITS = (1e-3, 1e6)  # of a strength: the evidence would take a good start for exact
 
 
 class PsfBlock(NamedTuple):

@@ -1,9 +1,11 @@
 """The pixels that measure a PSF: which sources reach them, and where in the PSF they lie."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.optimize import brentq
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.distortion import PolynomialDistortion
@@ -11,6 +13,7 @@ from bayesfred.model.kernels.psf_samples import SourceSamples, find_samples
 from bayesfred.model.parameters import BACKGROUND_POWERS, displacing
 from bayesfred.model.posterior import Posterior
 
+OUTLYING = 6.0  # standard deviations beyond which a pixel counts less
 DIMMEST = 1e-3  # counts that a pixel expects at the least: splines swing below zero
 
 
@@ -197,3 +200,26 @@ def template_pulls(data: PsfSamples, templates: Floats, score: Floats, sources: 
     source, each = data.samples.source, score[data.owner]
     pulls = [np.bincount(source, template * each, sources) for template in templates]
     return np.asarray(np.stack(pulls, axis=1).ravel(), dtype=np.float64)
+
+
+def likely_error(residual: Floats, variance: Floats, light: Floats) -> float:
+    """The most likely share of the light by which the model is off; 0 if the noise explains all.
+
+    Parameters
+    ----------
+    residual, variance, light : ndarray, shape (pixels,)
+
+    Returns
+    -------
+    float
+    """
+
+    def excess(error: float) -> float:
+        total = variance + (error * light) ** 2
+        z = np.minimum(residual**2 / total, OUTLYING**2)
+        return float(np.sum(light**2 / total * (z - 1.0)))
+
+    # the score of the squared error, in its standard deviations
+    if excess(0.0) < 3.0 * math.sqrt(2.0 * float(np.sum((light**2 / variance) ** 2))):
+        return 0.0
+    return float(brentq(excess, 0.0, 10.0, xtol=1e-4)) if excess(10.0) < 0.0 else 10.0
