@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import entry, inner, shared
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import Degrees, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import (
@@ -62,14 +62,14 @@ class Sampler(NamedTuple):
     degrees: Degrees
 
 
-@inner()
+@inner(inline="always")
 def new_sampler(layout):
     """The sampler of a layout's sources; `of_source` makes one source's of it."""
     o = layout.optics
     return Sampler(o.psf, 1.0 / layout.sigma, layout.work, o.degrees)
 
 
-@inner()
+@inner(inline="always")
 def of_source(sampler, source):
     """The sampler of one source."""
     psf, inverse, work, degrees = sampler
@@ -123,7 +123,7 @@ def widens(basis):
     return size > 0 and basis.row[-1] == basis.f.shape[0] + basis.g.shape[0] + 1
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _polynomial_row(out, line, coefficients, degree):
     """out[i] = a polynomial of t."""
     top, ramp, t0 = len(degree), line.ramp, line.t0
@@ -135,7 +135,7 @@ def _polynomial_row(out, line, coefficients, degree):
         out[i] = p
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _times_polynomial(out, source, factor, line, coefficients, degree):
     """out[i] = factor times source[i] times a polynomial of t."""
     top, ramp, t0 = len(degree), line.ramp, line.t0
@@ -147,7 +147,7 @@ def _times_polynomial(out, source, factor, line, coefficients, degree):
         out[i] = p * factor * source[i]
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _slopes_row(psf, inverse, weight, p, a, b):
     """From a and b to weight times p, p_a and p_b."""
     slope = -weight * inverse
@@ -156,7 +156,7 @@ def _slopes_row(psf, inverse, weight, p, a, b):
         p[i], a[i], b[i] = weight * k, slope * x, slope * y
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _second_derivatives_row(psf, inverse, weight, along_a, samples):
     """The same for -p_a, or for -p_b, in place of p."""
     p, a, b = samples.p, samples.along_a, samples.along_b
@@ -167,7 +167,7 @@ def _second_derivatives_row(psf, inverse, weight, along_a, samples):
         a[i], b[i] = second * (xx if along_a else xy), second * (xy if along_a else yy)
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _times_determinant(p, size, signed):
     """From D in `signed` to size = p |D| and p sign(D)."""
     for i in range(p.size):
@@ -175,14 +175,14 @@ def _times_determinant(p, size, signed):
         signed[i] = p[i] if signed[i] > 0.0 else -p[i]
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _times_absolute(a, b, d):
     for i in range(d.size):
         a[i] *= abs(d[i])
         b[i] *= abs(d[i])
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def samples_row(sampler, weight, template, line, samples):
     """Sample P = weight p and what comes with it on the row that `sampler.work` describes.
 
@@ -204,7 +204,7 @@ def samples_row(sampler, weight, template, line, samples):
     _times_determinant(samples.p, samples.size, samples.signed)
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _add_widening(out, order, samples, sampler, line):
     """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma.
 
@@ -223,13 +223,13 @@ def _add_widening(out, order, samples, sampler, line):
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) * inverse
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _add_row_of(out, row):
     for i in range(row.size):
         out[i] += row[i]
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _powers_row(powers, ramp, u0, n):
     """powers[m] = u^m at u = u0 + ramp[i]."""
     powers[0, :n] = 1.0
@@ -239,7 +239,7 @@ def _powers_row(powers, ramp, u0, n):
             row[i] = before[i] * (u0 + ramp[i])
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _add_monomials(basis_powers, v, terms, powers, out, start):
     """Add B along + B_u first + B_v second to the rows of the basis from `start` on.
 
@@ -261,7 +261,7 @@ def _add_monomials(basis_powers, v, terms, powers, out, start):
                 row[i] += bx * lower[i] * first[i]
 
 
-@shared(fastmath=FAST, error_model="numpy")
+@shared(_nrt=False, fastmath=FAST, error_model="numpy")
 def basis_row(rows, source, u_row, v_row, n, template):
     """Fill rows.out with the basis of a unit source in n pixels from (u_row, v_row) on.
 
@@ -335,6 +335,17 @@ def second_derivatives(layout, rows, s, flux):
     return second
 
 
+@leaf(fastmath=FAST)
+def _add_derivatives(flux, factors, index, basis_rows, out):
+    """Add those of a row of pixels, shape (parameters, pixels)."""
+    for k in range(index.size):
+        c = flux * factors[k]
+        if c != 0.0:
+            derivative, target = basis_rows[index[k]], out[k]
+            for i in range(target.size):
+                target[i] += c * derivative[i]
+
+
 @shared(fastmath=FAST)
 def add_jacobian_rows(layout, basis, flux, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
@@ -358,13 +369,9 @@ def add_jacobian_rows(layout, basis, flux, first, last, out):
             if not is_product_row(lines, monomials, inverse, (j, low, n), basis_rows):
                 u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
                 basis_row(rows, source, u, v, n, np.int64(0))
-            for k in range(index.size):
-                c = flux[s] * factors[s, k]
-                if c != 0.0:
-                    derivative = basis_rows[index[k]]
-                    target = out[k, j - first, low : low + n]
-                    for i in range(n):
-                        target[i] += c * derivative[i]
+            _add_derivatives(
+                flux[s], factors[s], index, basis_rows, out[:, j - first, low : low + n]
+            )
 
 
 @entry()

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import inner, shared
+from bayesfred.imaging.kernels.compilation import inner, leaf, shared
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import one_source
 from bayesfred.imaging.kernels.jacobian import (
@@ -43,7 +43,7 @@ def new_sums(o, basis, width):
     return Sums(np.empty((6, width)), np.empty((3, n)), np.empty((7, n, n)), np.zeros(size))
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _weigh_row(weight, samples):
     """Multiply A, B and E by the weight; returns the sum of weight times P |D|."""
     size, a, b, e = samples.size, samples.along_a, samples.along_b, samples.signed
@@ -56,7 +56,7 @@ def _weigh_row(weight, samples):
     return total
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _two_moments(power, line, samples, out):
     """Sums of A, B and E times power and times power t into the columns of out.
 
@@ -77,7 +77,7 @@ def _two_moments(power, line, samples, out):
     out[0, 0], out[0, 1], out[1, 0], out[1, 1], out[2, 0], out[2, 1] = a0, a1, b0, b1, e0, e1
 
 
-@inner()
+@leaf()
 def _multiply_out(sums, a, b, degree):
     """From sums over t^m w^n times E to those times b_v E, -b_u E, -a_v E and a_u E."""
     top, e = len(degree), sums[2]
@@ -93,7 +93,7 @@ def _multiply_out(sums, a, b, degree):
                     g_v[m, n] += (k + 1) * a[k + 1, i] * e[m + k, n + i]
 
 
-@inner()
+@leaf()
 def _shift_sums(sums, h, k, degree):
     """From sums over t^m w^n to sums over (t + h)^m (w + k)^n, in place."""
     top = len(degree)
@@ -107,7 +107,7 @@ def _shift_sums(sums, h, k, degree):
                 sums[m, n] += k * sums[m, n - 1]
 
 
-@inner()
+@leaf()
 def _add_sums(basis_powers, along, first, second, out):
     """Add the sums over B along + B_u first + B_v second, B = u^m v^n of f (or of g), to out."""
     for k in range(basis_powers.shape[0]):
@@ -119,7 +119,7 @@ def _add_sums(basis_powers, along, first, second, out):
             out[k] += n * second[m, n - 1]
 
 
-@inner()
+@leaf()
 def _add_moments(sums, moments, w):
     """Add a row's moments times w^k to the sums over t^m w^k."""
     size = sums.shape[1] - 1
@@ -132,7 +132,7 @@ def _add_moments(sums, moments, w):
         factor *= w
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _sample_sums(layout, source, rows, template, weight, buffers):
     """Fill the sums of A, B and E over these rows of the footprints; returns that of P |D|."""
     # what the rows share is taken out of the tuples once, see `Sampler`

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesfred.imaging.kernels.compilation import inner, shared
+from bayesfred.imaging.kernels.compilation import inner, leaf, shared
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.contexts import Clusters, Group
 
@@ -140,7 +140,7 @@ def run_end(fp, i, last, at):
     return i
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE, error_model="numpy")
 def dot(a, b, weight):
     """The sum of weight a b."""
     total = 0.0
@@ -149,7 +149,7 @@ def dot(a, b, weight):
     return total
 
 
-@inner()
+@leaf()
 def copy(values, out):
     """Copy a row of numbers, which numba's own assignment would not compile in less than 4 s."""
     for i in range(values.size):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.geometry import layout_of, row_starts
 from bayesfred.imaging.kernels.jacobian import add_jacobian_rows
@@ -87,7 +87,7 @@ def _fill_background(frame, band, sources):
                 out[sources + 5, i, k] = v * v
 
 
-@inner()
+@leaf()
 def _add_products(w, band, out):
     """Add the band's J W J^T to the lower triangle."""
     jacobian, top, weights = band.jacobian, band.top, w.weight
@@ -104,7 +104,7 @@ def _add_products(w, band, out):
             start, stop = next_run(w, j, stop)
 
 
-@inner()
+@leaf()
 def _add_cross(w, band, profiled, cross):
     """Add the band's products of the sources' templates and J to C^T."""
     if profiled is not None:
