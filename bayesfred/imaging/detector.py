@@ -175,7 +175,7 @@ class Detector:
             rule = shared_rule(sigma / side, beta, BOX_TOLERANCE, BOX_TOLERANCE_NARROWED)
         if rule is None or rule.offsets.size >= offsets.size:
             return PixelRule(offsets, weights[None])
-        return PixelRule(side * rule.offsets, side * rule.weights)
+        return PixelRule(side * rule.offsets, side * rule.weights, rule.shares)
 
 
 def _centred(n: int) -> Floats:

@@ -83,5 +83,5 @@ def shared_rule(sigma: float, beta: float, tolerance: float, most: float) -> Pix
         error = np.abs(waves @ half - pixel)
         if error @ spectra[0] <= tolerance and error @ spectra[1] <= most:
             weights = np.concatenate([half[::-1], half[at.size % 2 :]])
-            return PixelRule(offsets, weights.reshape(-1, m))
+            return PixelRule(offsets, weights.reshape(-1, m), True)
     return None

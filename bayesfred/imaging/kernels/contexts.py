@@ -22,6 +22,8 @@ class PixelRule(NamedTuple):
 
     offsets: Floats  # (m,) of a pixel's own points from its centre
     weights: Floats  # (2 reach + 1, m) of the points of the pixels before, in, and after it
+    # whether reach > 0; None, a type of its own, where not: nothing of that is compiled then
+    shares: Literal[True] | None = None
 
 
 class Optics(NamedTuple):

@@ -339,14 +339,15 @@ def find_patch(o, fp, s, rows):
 
 
 @inner()
-def _new_patch(o, fp):
+def _new_patch(shares, o, fp):
     """Room for what `render` makes of a source: light, a filtered column of samples, samples."""
+    if shares is None:
+        return np.empty(0)
     reach, m, largest = o.rule.weights.shape[0] // 2, o.rule.weights.shape[1], 0
-    if reach > 0:
-        for s in range(fp.first.size - 1):
-            rows = fp.first[s], fp.first[s + 1]
-            room = (rows[1] - rows[0] + 2 * reach) * find_patch(o, fp, s, rows).pitch + 2 * LANES
-            largest = max(largest, room)
+    for s in range(fp.first.size - 1):
+        rows = fp.first[s], fp.first[s + 1]
+        room = (rows[1] - rows[0] + 2 * reach) * find_patch(o, fp, s, rows).pitch + 2 * LANES
+        largest = max(largest, room)
     return np.empty((m * m + 2) * largest)
 
 
@@ -354,7 +355,7 @@ def _new_patch(o, fp):
 def layout_of(o, geometry, fp, sigma):
     """The sources as they lie on the frame, their footprints known."""
     places = new_places(o.psf, o.ramp.size)
-    return Layout(o, geometry, fp, sigma, new_work(o), places, _new_patch(o, fp))
+    return Layout(o, geometry, fp, sigma, new_work(o), places, _new_patch(o.rule.shares, o, fp))
 
 
 @inner()

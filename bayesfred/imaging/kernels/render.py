@@ -168,12 +168,12 @@ def _add_canvas(sizes, rows, alone, canvas):
 
 
 @leaf(fastmath=FAST, error_model="numpy")
-def _add_image(layout, s, rows, flux, canvas):
+def _add_image(shares, layout, s, rows, flux, canvas):
     """Add rows of a source whose image is no product."""
     o, fp = layout.optics, layout.footprints
     source = one_source(layout.geometry, s)
     psf = psf_of_source(o.psf, source.number)
-    if o.rule.weights.shape[0] == 1:
+    if shares is None:
         _add_rows(layout, source, psf, (rows, flux), canvas)
     else:
         _add_shared(layout, source, psf, find_patch(o, fp, s, rows), flux, canvas)
@@ -194,14 +194,15 @@ def add_source(layout, s, rows, flux, canvas, alone):
 
     `alone` is None or a canvas where the source alone is left.
     """
-    translates, sizes = layout.optics.translates, layout.footprints.size
+    o, sizes = layout.optics, layout.footprints.size
+    translates, shares = o.translates, o.rule.shares
     if rows[0] >= rows[1] or _add_if_product(translates, layout, (s, flux), rows, canvas, alone):
         return
     if alone is None:
-        _add_image(layout, s, rows, flux, canvas)
+        _add_image(shares, layout, s, rows, flux, canvas)
     else:
         _clear_rows(sizes, rows, alone)
-        _add_image(layout, s, rows, flux, alone)
+        _add_image(shares, layout, s, rows, flux, alone)
         _add_canvas(sizes, rows, alone, canvas)
 
 
