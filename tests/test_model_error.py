@@ -32,6 +32,7 @@ from bayesfred.model.noise import (
 )
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.psf_errors import OccamFactor, PsfErrors
 from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chainfile import open_chain
 from bayesfred.sampling.sampler import sample
@@ -150,6 +151,26 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     assert posterior.gradient(params) * scale == pytest.approx(
         numerical * scale, rel=1e-6, abs=1e-6
     )
+
+
+def test_occam_factor_of_a_measured_psf_is_in_density_and_gradient() -> None:
+    posterior, params = frame("photons")
+    k = posterior.parameter_names.index("model_error")
+    occam = OccamFactor(np.array([9.0, 30.0]), np.array([0.03, 0.2]))
+    none = np.zeros((params.size, params.size))
+    errors = PsfErrors(posterior.parameter_names, none, 39.0, occam)
+    other = replace(posterior, psf_errors=errors)
+    more = occam.log(params[k])
+    assert more == pytest.approx(4.5 * math.log(1 + (0.1 / 0.03) ** 2) + 15 * math.log(1.25))
+    assert other.log_prob(params) - posterior.log_prob(params) == pytest.approx(more)
+    change = other.gradient(params) - posterior.gradient(params)
+    h = 1e-5
+    numerical = (occam.log(params[k] + h) - occam.log(params[k] - h)) / (2.0 * h)
+    assert change[k] == pytest.approx(numerical, rel=1e-6)
+    assert not np.any(np.delete(change, k))
+    second = (occam.slope(params[k] + h) - occam.slope(params[k] - h)) / (2.0 * h)
+    gained = other.fisher(params) - posterior.fisher(params)
+    assert gained[k, k] == pytest.approx(max(-second, 0.0), rel=1e-5)
 
 
 @pytest.mark.slow

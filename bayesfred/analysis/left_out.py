@@ -131,7 +131,7 @@ def leave_out(
         others = (folds.pixels >= 0) & ~np.isin(folds.pixels, left)
         fitted, found = _fitted(_seeing(posterior, others), estimate)
         draws = _draws(found, random)
-        known = _likelihoods(fitted, draws)
+        known = _likelihoods(_seeing(fitted, others), draws)
         for k in left:
             both = _likelihoods(_seeing(fitted, others | (folds.pixels == k)), draws)
             density[k], errors[k] = _log_mean(known, both)

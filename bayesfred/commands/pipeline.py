@@ -101,7 +101,7 @@ def read_frame(
         if has_pixel(posterior.model.psf) or rough:
             with working("measuring the PSF", show=say is not None):
                 posterior, estimate = _with_measured_psf(posterior, estimate, psf, run)
-            note(psf_message(posterior))
+            note(psf_message(posterior, estimate))
     return posterior, estimate, notes
 
 

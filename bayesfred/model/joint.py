@@ -187,8 +187,8 @@ class JointPosterior(FrameDensity):
         errors = frame.psf_errors
         if self.psf_errors is not None:
             covariance = self.frame_covariance(name, self.psf_errors.covariance)
-            absorbed = errors.absorbed if errors else 0.0
-            errors = PsfErrors(frame.parameter_names, covariance, absorbed)
+            own = (errors.absorbed, errors.occam) if errors else ()
+            errors = PsfErrors(frame.parameter_names, covariance, *own)
         return replace(frame, prior=prior, psf_errors=errors)
 
     def frame_params(self, name: str, params: npt.ArrayLike) -> Floats:

@@ -43,13 +43,17 @@ from bayesfred.model.parameters import (
     SOURCE_NUISANCES,
     Nuisances,
     Parameter,
+    chain_rule,
     displacing,
 )
-from bayesfred.model.pixels import padded_frame, polynomial_background
+from bayesfred.model.pixels import (
+    counts_constant,
+    faint_fluxes,
+    padded_frame,
+    polynomial_background,
+)
+from bayesfred.model.psf_errors import OccamFactor
 from bayesfred.model.threads import share
-
-BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
-BLOCK = 2**21  # pixels of a large frame that are looked at together
 
 
 class Expected(NamedTuple):
@@ -78,6 +82,8 @@ class FrameLikelihood:
         Width of the narrowest PSF for which pixels have to be integrated well.
     extrapolation : FluxExtrapolation, optional
         Where free fluxes have their maximum, near some parameters; see `near`.
+    occam : OccamFactor, optional
+        What a PSF that was measured on the frame says of the model error.
     """
 
     model: ForwardModel
@@ -88,6 +94,7 @@ class FrameLikelihood:
     parameters: tuple[Parameter, ...]
     narrowest: float | None = None
     extrapolation: FluxExtrapolation | None = None
+    occam: OccamFactor | None = None
 
     def log_likelihood(self, vectors: Floats, wanted: Flags) -> Floats:
         """Log-likelihood of n vectors, shape (n, d), in as many threads as numba may use.
@@ -103,6 +110,9 @@ class FrameLikelihood:
         left = np.nan_to_num(out[rows], neginf=-np.inf)
         self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left)
         out[rows] = left
+        if self.occam:
+            there = out > -np.inf
+            out[there] += self.occam.log(vectors[there, self._error])
         return out + self._constant
 
     def _evaluate(self, kernel: Callable[..., None], vectors: Vectors, out: Floats) -> None:
@@ -147,7 +157,10 @@ class FrameLikelihood:
             slopes, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if np.isnan(slopes[0]):
             return np.full(len(self.parameters), np.nan)
-        return np.asarray(np.concatenate([sources, slopes, background]) @ self._chain_rule(params))
+        found = np.concatenate([sources, slopes, background]) @ self._chain_rule(params)
+        if self.occam:
+            found[self._error] += self.occam.slope(params[self._error])
+        return np.asarray(found)
 
     def fisher(self, params: Floats) -> Floats:
         """Fisher information, free fluxes profiled out, shape (d, d); NaN where there is none."""
@@ -166,7 +179,10 @@ class FrameLikelihood:
         own = slice(sources, sources + apart)
         out[own, own] = np.diag(known)
         change = self._chain_rule(params)
-        return np.asarray(change.T @ out @ change)
+        found = change.T @ out @ change
+        if self.occam:
+            found[self._error, self._error] += self.occam.information(params[self._error])
+        return np.asarray(found)
 
     def expected_counts(self, params: Floats) -> Floats:
         """Expected counts: see `Posterior.expected_counts`."""
@@ -304,26 +320,7 @@ class FrameLikelihood:
         return np.array([row.neutral(self.model.psf.sigma) for row in SOURCE_NUISANCES])
 
     def _chain_rule(self, params: Floats) -> Floats:
-        """Derivatives of what the kernels differentiate by with respect to the parameters.
-
-        Its rows are the distortion's monomials, the free nuisances of the sources, `SCALES` and the
-        background's terms. The kernels' derivative by flux is relative to the scaled flux.
-        """
-        d = self.model.polynomial
-        change = np.eye(d.n_terms) if d.basis is None else d.basis
-        monomials, sources = len(change), self._basis.row.size
-        out = np.zeros((sources + len(SCALES) + len(BACKGROUND_TERMS), len(self.parameters)))
-        for k, parameter in enumerate(self.parameters):
-            if parameter.kind == "distortion":
-                out[:monomials, k] = change[:, parameter.slot]
-            elif parameter.kind == "background":
-                out[sources + len(SCALES) + parameter.slot, k] = 1.0
-            elif parameter.name in SCALES:
-                out[sources + SCALES.index(parameter.name), k] = 1.0
-            else:
-                scale = 1.0 / params[k] if parameter.name == "flux_scale" else 1.0
-                out[monomials + self._moving.index(parameter.name), k] = scale
-        return out
+        return chain_rule(self.parameters, params, self.model.polynomial, self._moving)
 
     @contextmanager
     def _workspace(self) -> Iterator[Workspace]:
@@ -362,6 +359,11 @@ class FrameLikelihood:
         return [name for name in self.nuisances.source_names if name not in SCALES]
 
     @property
+    def _error(self) -> int:
+        """Where the model error is among the parameters."""
+        return [parameter.name for parameter in self.parameters].index("model_error")
+
+    @property
     def _flux(self) -> Floats:
         return self.model.sources.flux
 
@@ -371,14 +373,10 @@ class FrameLikelihood:
 
     @cached_property
     def _faint(self) -> Flags:
-        """Free fluxes of fewer than `BRIGHT` standard deviations, by catalogue and frame."""
+        """Free fluxes for which Laplace's approximation is not enough."""
         if not self._free:
             return np.zeros(self._flux.size, bool)
-        with np.errstate(all="ignore"):  # at a mean of zero
-            counts = np.maximum(self.counts, 0.0)
-            variance = float(np.median(self.noise.counts_variance(counts, counts)[self.mask]))
-        area = 4.0 * np.pi * (self.model.psf.sigma / self.model.detector.binning) ** 2
-        return self._flux**2 < BRIGHT**2 * (self._flux + area * variance)
+        return faint_fluxes(self.model, self.counts, self.mask, self.noise)
 
     @cached_property
     def _problem(self) -> Problem:
@@ -391,10 +389,7 @@ class FrameLikelihood:
 
     @cached_property
     def _constant(self) -> float:
-        """The part of the log-likelihood that depends on the counts alone."""
-        rows = max(1, BLOCK // self.mask.shape[1])
-        some = (slice(k, k + rows) for k in range(0, len(self.mask), rows))
-        return sum(self.noise.at(s).constant(self.counts[s], self.mask[s]) for s in some)
+        return counts_constant(self.counts, self.mask, self.noise)
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}

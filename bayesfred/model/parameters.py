@@ -16,6 +16,7 @@ from scipy import stats
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.io.serialize import serializable
 
@@ -350,3 +351,42 @@ def _background_term(slot: int, context: _Context) -> Parameter:
         BACKGROUND_TERMS[slot], "" if constant else "b", powers, "counts", 0,
         context.level if constant else 0.0, start, prior, slot, "background",
     )  # fmt: skip
+
+
+def chain_rule(
+    parameters: tuple[Parameter, ...],
+    params: Floats,
+    distortion: PolynomialDistortion,
+    moving: list[str],
+) -> Floats:
+    """Derivatives of what the kernels differentiate by with respect to the parameters.
+
+    Its rows are the distortion's monomials, the free nuisances of the sources, `SCALES` and the
+    background's terms. The kernels' derivative by flux is relative to the scaled flux.
+
+    Parameters
+    ----------
+    parameters : tuple of Parameter
+    params : ndarray, shape (d,)
+    distortion : PolynomialDistortion
+    moving : list of str
+        The free nuisances that change the expected counts.
+
+    Returns
+    -------
+    ndarray, shape (rows, d)
+    """
+    change = np.eye(distortion.n_terms) if distortion.basis is None else distortion.basis
+    monomials, sources = len(change), len(change) + len(moving)
+    out = np.zeros((sources + len(SCALES) + len(BACKGROUND_TERMS), len(parameters)))
+    for k, parameter in enumerate(parameters):
+        if parameter.kind == "distortion":
+            out[:monomials, k] = change[:, parameter.slot]
+        elif parameter.kind == "background":
+            out[sources + len(SCALES) + parameter.slot, k] = 1.0
+        elif parameter.name in SCALES:
+            out[sources + SCALES.index(parameter.name), k] = 1.0
+        else:
+            scale = 1.0 / params[k] if parameter.name == "flux_scale" else 1.0
+            out[monomials + moving.index(parameter.name), k] = scale
+    return out

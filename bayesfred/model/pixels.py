@@ -16,6 +16,8 @@ from bayesfred.model.parameters import BACKGROUND_POWERS, Nuisances
 
 OVERLAP = 12.0  # PSF widths beyond which sources have nothing to do with one another
 BYTES_A_PAIR = 200.0  # that overlaps, in the search for the maximum
+BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
+BLOCK = 2**21  # pixels of a large frame that are looked at together
 
 
 def usable_pixels(
@@ -143,3 +145,43 @@ def polynomial_background(shape: tuple[int, ...], coefficients: Floats) -> Float
         if value:
             out += value * u**m * v[:, None] ** n
     return out
+
+
+def faint_fluxes(model: ForwardModel, counts: Floats, used: Flags, noise: Noise) -> Flags:
+    """Fluxes of fewer than `BRIGHT` standard deviations, by catalogue and frame.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    counts : ndarray, shape (ny, nx), counts
+    used : ndarray of bool, shape (ny, nx)
+    noise : Noise
+
+    Returns
+    -------
+    ndarray of bool, shape (s,)
+    """
+    flux = model.sources.flux
+    with np.errstate(all="ignore"):  # at a mean of zero
+        positive = np.maximum(counts, 0.0)
+        variance = float(np.median(noise.counts_variance(positive, positive)[used]))
+    area = 4.0 * np.pi * (model.psf.sigma / model.detector.binning) ** 2
+    return np.asarray(flux**2 < BRIGHT**2 * (flux + area * variance))
+
+
+def counts_constant(counts: Floats, used: Flags, noise: Noise) -> float:
+    """The part of the log-likelihood that depends on the counts alone.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (ny, nx), counts
+    used : ndarray of bool, shape (ny, nx)
+    noise : Noise
+
+    Returns
+    -------
+    float
+    """
+    rows = max(1, BLOCK // used.shape[1])
+    some = (slice(k, k + rows) for k in range(0, len(used), rows))
+    return sum(noise.at(s).constant(counts[s], used[s]) for s in some)

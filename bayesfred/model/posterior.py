@@ -55,7 +55,8 @@ class Posterior(FrameDensity):
         True where a pixel may be used when the footprint moves; by default `mask`.
     psf_errors : PsfErrors, optional
         What the errors of a measured PSF add to the parameters': `marginalize_psf` finds it.
-        `log_prob` is that with the PSF fixed; `MapEstimate.covariance` and `Chain.draws` have them.
+        `log_prob` is that with the PSF fixed, but for its volume's word on the model error;
+        `MapEstimate.covariance` and `Chain.draws` have them.
 
     Attributes
     ----------
@@ -131,9 +132,10 @@ class Posterior(FrameDensity):
         """The likelihood of the frame."""
         width = self.prior.get("psf_sigma")
         narrowest = None if width is None else float(width.ppf(1e-6))
+        occam = None if self.psf_errors is None else self.psf_errors.occam
         return FrameLikelihood(
             self.model, self.counts, self.noise, self.mask, self.nuisances, self.parameters,
-            narrowest, self.extrapolation,
+            narrowest, self.extrapolation, occam,
         )  # fmt: skip
 
     @cached_property

@@ -16,9 +16,14 @@ inverse of I^-1 + W, is Schur's complement of the joint information of parameter
 W hardly depends on how much positions or light scatter about the model, unlike the information that
 is lost: the scatter widens what every source says, the PSF moves all of them together. Parameters
 that are such scales are left as they are.
+
+A model error is another matter. The PSF's numbers fit what the model lacks on their own stars, so
+the residuals are too small for it. With the PSF integrated out, its likelihood is multiplied by the
+volume of the PSF's posterior, which grows as the model error takes information away: see
+`OccamFactor`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -30,6 +35,56 @@ from bayesfred.io.serialize import serializable
 from bayesfred.model.parameters import SCALES
 
 STREAM = 0x507F  # of random numbers, beside those of a run's steps
+
+
+@serializable("occam_factor")
+@dataclass(frozen=True, eq=False)
+class OccamFactor:
+    """What the volume of a PSF's posterior says of the model error.
+
+    Its logarithm is that of the volume at a model error eps over that without one,
+
+        sum over k of n_k / 2 log(1 + (eps / s_k)^2):
+
+    n_k numbers of the PSF are known by pixels whose noise is a share s_k of their light. This is
+    the restricted likelihood of a variance.
+
+    Attributes
+    ----------
+    numbers : ndarray, shape (k,)
+        n.
+    scales : ndarray, shape (k,)
+        s.
+
+    References
+    ----------
+    D. MacKay, Neural Computation 4, 415 (1992), Sect. 3. H. D. Patterson, R. Thompson (1971),
+    Biometrika 58, 545: restricted maximum likelihood.
+
+    Examples
+    --------
+    >>> factor = OccamFactor(np.array([2.0]), np.array([0.1]))
+    >>> round(float(factor.log(0.1)), 6), round(float(factor.slope(0.1)), 6)
+    (0.693147, 10.0)
+    """
+
+    numbers: Floats
+    scales: Floats
+
+    def log(self, error: Floats | float) -> Floats:
+        """The logarithm at model errors, shape (n,)."""
+        ratio = np.asarray(error)[..., None] / self.scales
+        return np.asarray(0.5 * np.log1p(ratio**2) @ self.numbers)
+
+    def slope(self, error: float) -> float:
+        """The derivative of the logarithm."""
+        return float(error / (self.scales**2 + error**2) @ self.numbers)
+
+    def information(self, error: float) -> float:
+        """Minus the second derivative where it is positive."""
+        square = self.scales**2
+        curvature = (error**2 - square) / (square + error**2) ** 2 @ self.numbers
+        return max(float(curvature), 0.0)
 
 
 @serializable("psf_errors")
@@ -45,6 +100,8 @@ class PsfErrors:
         W.
     absorbed : float
         How many numbers of the PSF the same frame's counts determined: they are fitted, too.
+    occam : OccamFactor or None
+        What they say of the model error; None where it is no parameter.
 
     Raises
     ------
@@ -61,6 +118,7 @@ class PsfErrors:
     names: tuple[str, ...]
     covariance: Floats
     absorbed: float = 0.0
+    occam: OccamFactor | None = field(default=None, metadata={"since": 8})
 
     def __post_init__(self) -> None:
         d = len(self.names)
@@ -82,6 +140,7 @@ class PsfErrors:
         information: Floats,
         gradients: Floats,
         absorbed: float = 0.0,
+        occam: OccamFactor | None = None,
     ) -> Self:
         """The errors that gradients of the log-posterior, one for each draw of a PSF, stand for.
 
@@ -92,6 +151,7 @@ class PsfErrors:
             With the PSF fixed, I.
         gradients : ndarray, shape (draws, d)
         absorbed : float
+        occam : OccamFactor, optional
 
         Returns
         -------
@@ -103,7 +163,7 @@ class PsfErrors:
         factor = linalg.cho_factor(block * np.outer(scale, scale))
         every = np.zeros((len(gradients), len(names)))
         every[:, moved] = scale * linalg.cho_solve(factor, (gradients[:, moved] * scale).T).T
-        return cls(names, np.atleast_2d(np.cov(every.T)), absorbed)
+        return cls(names, np.atleast_2d(np.cov(every.T)), absorbed, occam)
 
     def displacements(self, n: int, seed: int) -> Floats:
         """Draws of what another PSF would add to the parameters, shape (n, d).

@@ -10,12 +10,12 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import FWHM, MeasuredPSF
 from bayesfred.model.posterior import Posterior
-from bayesfred.model.psf_errors import PsfErrors
+from bayesfred.model.psf_errors import OccamFactor, PsfErrors
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import maximize
-from bayesfred.optimize.psf_equations import shared_information
+from bayesfred.optimize.psf_marginal import occam_factor, shared_information
 
 LARGEST_ERROR = 0.1  # where the search for a model error begins: with more, misfits grow
 
@@ -91,7 +91,8 @@ def measure_psf(
         slopes = drawn @ shared_information(bare, state, top.params)
     else:
         slopes = _gradients(bare, psf, top.params)
-    measured = _marginalized(bare, slopes, top.params, psf.determined)
+    occam = occam_factor(bare, state, top.params) if bare.nuisances.model_error else None
+    measured = _marginalized(bare, slopes, top.params, psf.determined, occam)
     return measured, find_map(measured, top.params)
 
 
@@ -139,13 +140,15 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
     return _marginalized(bare, _gradients(bare, psf, estimate.params), estimate.params, 0.0)
 
 
-def psf_message(posterior: Posterior) -> str:
+def psf_message(posterior: Posterior, estimate: MapEstimate) -> str:
     """Say in a line what was found of a PSF.
 
     Parameters
     ----------
     posterior : Posterior
         With a `MeasuredPSF`.
+    estimate : MapEstimate
+        Its maximum.
 
     Returns
     -------
@@ -156,10 +159,12 @@ def psf_message(posterior: Posterior) -> str:
     errors = posterior.psf_errors
     here = "" if errors is None or errors.absorbed else " on another frame"
     varies = f", varying with degree {psf.degree} over the field" if psf.degree else ""
-    left = f"{psf.model_error:.1%} of the light unexplained" if psf.model_error else "noise is left"
+    known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
+    error = known.get("model_error", psf.model_error)
+    left = f", {error:.1%} of the light unexplained" if error else ""
     return (
         f"psf: measured{here}, FWHM {FWHM * psf.sigma:.2f} pixel with the pixel in it{varies}, "
-        f"{psf.determined:.0f} numbers determined, {left}"
+        f"{psf.determined:.0f} numbers determined{left}"
     )
 
 
@@ -175,9 +180,13 @@ def _gradients(posterior: Posterior, psf: MeasuredPSF, centre: Floats) -> Floats
 
 
 def _marginalized(
-    posterior: Posterior, slopes: Floats, centre: Floats, absorbed: float
+    posterior: Posterior,
+    slopes: Floats,
+    centre: Floats,
+    absorbed: float,
+    occam: OccamFactor | None = None,
 ) -> Posterior:
     slopes = slopes[np.isfinite(slopes).all(axis=1)]
     information = posterior.information(centre)
-    errors = PsfErrors.of(posterior.parameter_names, information, slopes, absorbed)
+    errors = PsfErrors.of(posterior.parameter_names, information, slopes, absorbed, occam)
     return replace(posterior, psf_errors=errors)

@@ -192,7 +192,7 @@ class PsfEquations:
         With equations that are `known` at a state nearby their information serves once more.
         """
         data = PsfSamples.at(posterior, state.params, state.shifts, state.grid.radius)
-        pixels = _pixels(posterior, state, data, 0.0 if exact else None)
+        pixels = observed(posterior, state, data, 0.0 if exact else None)
         score = pixels.score
         information = known.information if known else PsfInformation.of(posterior, state, pixels)
         psf = psf_slope(state.grid.unknown, pixels.terms, data.samples, state.fluxes, score)
@@ -245,12 +245,12 @@ class PsfEquations:
 
     def _constrained(self, solution: Floats, target: Floats) -> Floats:
         """The solution that meets the conventions and is nearest by the information."""
-        rows, towards = self.conventions, self._towards
+        rows, towards = self.conventions, self.towards
         excess = np.linalg.solve(rows @ towards, rows @ solution - target)
         return np.asarray(solution - towards @ excess)
 
     @cached_property
-    def _towards(self) -> Floats:
+    def towards(self) -> Floats:
         """How the unknowns follow the conventions."""
         return self._solved(self.conventions.T)
 
@@ -319,44 +319,12 @@ class PsfEquations:
         return out
 
 
-def shared_information(posterior: Posterior, state: PsfState, params: Floats) -> Floats:
-    """The information that a PSF's deviations share with a posterior's parameters.
-
-    Fluxes and shifts of single sources follow. The noise is the posterior's own, and no pixel
-    counts less. As in all equations here, f and g change with a coefficient over a source's image
-    as they do in its middle: that is exact where they do not depend on u and v.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        With the PSF.
-    state : PsfState
-        Where the PSF was found.
-    params : ndarray, shape (d,)
-        Maximum of the posterior.
-
-    Returns
-    -------
-    ndarray, shape (deviations, d)
-    """
-    grid = state.grid
-    _, _, fluxes, shifts = posterior.likelihood.own_pixels(params, grid.radius)
-    state = replace(state, params=params, fluxes=fluxes, shifts=shifts)
-    known = dict(zip(posterior.parameter_names, params, strict=True))
-    # what the equations of a PSF leave out in the corners of the grids is part of the PSF
-    corner = math.sqrt(0.5) * float(np.max((grid.levels.side + 4) * grid.levels.spacing))
-    data = PsfSamples.at(posterior, params, shifts, corner)
-    pixels = _pixels(posterior, state, data, known.get("model_error", 0.0), math.inf)
-    size = state.deviations.size
-    return np.asarray(PsfInformation.of(posterior, state, pixels).matrix[size:, :size].T)
-
-
 def field_radius(posterior: Posterior) -> float:
     """Half the frame's diagonal, pixel."""
     return 0.5 * math.hypot(*posterior.model.detector.fine_shape)
 
 
-def _pixels(
+def observed(
     posterior: Posterior,
     state: PsfState,
     data: PsfSamples,

@@ -134,8 +134,7 @@ def _psf_figures(posterior: Posterior) -> list[PageFigure]:
         PageFigure(
             "Point spread function",
             "As measured, with the pixel's response in it; bands hold 95 % of the draws from its "
-            f"posterior. {psf.determined:.0f} numbers of it are determined by the counts; it "
-            f"leaves {psf.model_error:.1%} of the light unexplained.",
+            f"posterior. {psf.determined:.0f} numbers of it are determined by the counts.",
             described_psf(psf),
             png(psf_panels(psf, posterior.model.detector.shape)),
         )
