@@ -107,6 +107,46 @@ def test_companions_are_found_and_nothing_else(seeds: range) -> None:
     assert clean[0].mask.sum() > 0
 
 
+HOT = 40
+
+
+def undersampled(seed: int, hot: int) -> tuple[bf.Posterior, Floats, Floats]:
+    """Stars of 1.2 pixels' FWHM, 6 others in pixels' middles, and hot pixels."""
+    rng = np.random.default_rng(seed)
+    grid = bf.SourceCatalog.grid(12, 12.0, 3e3)
+    sources = bf.SourceCatalog(
+        *(np.array([grid.x, grid.y]) + rng.uniform(-1, 1, (2, 144))), grid.flux
+    )
+    model = bf.ForwardModel(
+        bf.Detector((161, 161), pixel="box"), sources, bf.GaussianPSF(0.5), LINEAR
+    )
+    cells = rng.permutation(121)[: 6 + HOT]
+    places = np.stack(np.divmod(cells, 11)) * 12.0 - 60.0 + rng.integers(-1, 2, (2, 6 + HOT))
+    others = bf.SourceCatalog(*places[:, :6], np.geomspace(300.0, 3e3, 6))
+    light = replace(model, sources=others).expected_counts(np.zeros(4))
+    counts = rng.poisson(model.expected_counts(np.zeros(4), 20.0) + light).astype(float)
+    u, v = (places[:, 6 : 6 + hot] + 80).astype(int)
+    counts[v, u] += rng.uniform(300.0, 3e3, hot).round()
+    nuisances = bf.Nuisances("free", psf_sigma=True, footprint=9.0)
+    narrow = replace(model, psf=bf.GaussianPSF(0.6))
+    posterior = bf.Posterior(narrow, counts, noise=bf.PoissonNoise(3.0), nuisances=nuisances)
+    return posterior, places[:, :6], np.stack([u, v])
+
+
+def test_hot_pixels_are_no_sources_though_stars_are_undersampled() -> None:
+    posterior, stars, hot = undersampled(1, HOT)
+    found = looked(posterior)
+    at = set(zip(*np.nonzero(found.sharp), strict=True))
+    assert at == set(zip(hot[1], hot[0], strict=True))
+    assert not found.mask[hot[1], hot[0]].any() and "40 pixels sharper" in found.message
+    # the others are found, and they alone, though the sharpest image possible is theirs
+    distance = np.hypot(*(np.array([found.u, found.v])[:, :, None] - stars[:, None])).min(axis=1)
+    assert len(found.u) == 6 and np.all(distance < 0.5)
+    # negative control
+    none = looked(undersampled(1, 0)[0])
+    assert not none.sharp.any() and "sharper" not in none.message
+
+
 @pytest.mark.statistics
 def test_wings_of_the_psf_are_no_companions() -> None:
     """Moffat images fitted with a Gaussian leave a ring around every bright star."""

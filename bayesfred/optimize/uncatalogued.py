@@ -12,6 +12,12 @@ stands near one star of many. So near stars a peak has to exceed, too, 2.5 times
 common: the 75 % quantile of the bright stars'. Where such peaks stand near more than a few stars,
 it is the PSF still, and the share is doubled until they do not.
 
+Light that is sharper than the stars' is no source but a hot pixel or a cosmic ray. What the eight
+pixels beside a star's middle hold of what that pixel holds is least where its image is in the
+middle of the pixel: rho, the 10 % quantile of the bright stars'. A pixel with less than half of rho
+beside it, by 5 standard deviations, and more light than the stars have there, is masked by itself
+before anything is filtered. Where no test can tell, it counts as a source.
+
 A catalogued source that would keep less than half of its light says little but where it might be:
 behind the mask, as bright as can be. It is left out with all of its pixels.
 """
@@ -37,6 +43,9 @@ FEW, MANY = 5, 0.05  # so many near stars, or this share of the stars, may be fo
 LOOSER = 6  # times the misfit is doubled, at most, until they are so few: then it is the PSF's
 LOOKS = 5  # for peaks, also for those hidden by others
 NAMED = 10  # sources in the message
+SHARPEST, FEWEST = 0.1, 5  # quantile of the bright stars' images, and how many tell it
+SHARP = 0.5  # of what these have beside their middle
+BRIGHTER = 1.0  # than the stars' light there is a sharp pixel: less may be the PSF's misfit
 LEFT = 0.5  # share of its light that a source must keep, or it is left out with the light beside it
 
 
@@ -50,19 +59,23 @@ class UncataloguedSources:
         Where it is, from the middle of the frame; the brightest first.
     photons, sd : ndarray, shape (n,), counts
         Its flux, for an image like the PSF, and the standard deviation from the noise.
+    sharp : ndarray of bool, shape (ny, nx)
+        Pixels of the posterior whose light is sharper than the stars': hot ones, cosmic rays.
     mask : ndarray of bool, shape (ny, nx)
-        The posterior's pixels but for those that this light reaches, and for those of catalogued
-        sources that it hides.
+        The posterior's pixels but for those that this light reaches, for sharp ones, and for those
+        of catalogued sources that are hidden.
     hidden : ndarray of int
         These sources' numbers in the catalogue, from 0.
     message : str
-        One line: how many there are, the brightest ones' positions and photons, and what they hide.
+        One line: how many there are, the brightest ones' positions and photons, and what they hide;
+        how many pixels are sharp.
     """
 
     u: Floats
     v: Floats
     photons: Floats
     sd: Floats
+    sharp: Flags
     mask: Flags
     hidden: Ints
     message: str
@@ -113,9 +126,12 @@ def find_uncatalogued(posterior: Posterior, estimate: MapEstimate) -> Uncatalogu
     found, sd = found[order], sd[order]
     detector = posterior.model.detector
     v, u = (found[:, :2] - 0.5 * (np.array(detector.shape) - 1.0)).T * detector.binning
-    kept, hidden = frame.without_hidden(posterior.mask & ~covered)
+    kept, hidden = frame.without_hidden(posterior.mask & ~covered & ~frame.sharp)
+    sharp = posterior.mask & frame.sharp
     message = _message(u, v, found[:, 2], hidden)
-    return UncataloguedSources(u, v, found[:, 2], sd, kept, hidden, message)
+    if n := int(sharp.sum()):
+        message += f"; {n} pixel{'s' * (n > 1)} sharper than the stars: hot pixels or cosmic rays"
+    return UncataloguedSources(u, v, found[:, 2], sd, sharp, kept, hidden, message)
 
 
 def _message(u: Floats, v: Floats, photons: Floats, hidden: Ints) -> str:
@@ -128,6 +144,11 @@ def _message(u: Floats, v: Floats, photons: Floats, hidden: Ints) -> str:
     rows = ", ".join(map(str, hidden[:NAMED])) + ", ..." * (hidden.size > NAMED)
     lost = f"; hidden by them: rows {rows} of the catalogue, from 0" if hidden.size else ""
     return f"{n} source{'s' * (n > 1)} that the catalogue lacks: {places}{more}{lost}"
+
+
+def _around(image: Floats) -> Floats:
+    """The sum over the eight pixels around every one."""
+    return np.asarray(9.0 * ndimage.uniform_filter(image, 3, mode="constant") - image)
 
 
 class _Filtered:
@@ -150,6 +171,8 @@ class _Filtered:
         self.flux = posterior.fluxes(params)
         seen = np.isfinite(images).all(axis=1) & np.isfinite(self.flux)
         self.rows, self.images, self.flux = np.flatnonzero(seen), images[seen], self.flux[seen]
+        self.sharp = self._sharp(posterior.likelihood.background(params))
+        self.valid = posterior.valid & ~self.sharp
         reach = 2 * int(np.ceil(4.0 * self.width)) + 1
         delta = np.zeros((reach, reach))
         delta[reach // 2, reach // 2] = 1.0
@@ -157,14 +180,43 @@ class _Filtered:
         self.sd = self.noise(self.variance)
         self.misfit = self._misfit(self._excess(np.zeros((0, 3))))
 
+    def _sharp(self, level: Floats) -> Flags:
+        """Pixels that hold light sharper than the stars'; `level` is the background."""
+        none, stars = np.zeros(level.shape, bool), self._brightest()
+        if len(stars) < FEWEST:
+            return none
+        valid = self.posterior.valid
+        whole = ndimage.minimum_filter(valid, 3, mode="constant", cval=False)
+        light, here = (
+            np.where(valid, image, 0.0) for image in (self.posterior.counts - level, self.residual)
+        )
+        at = tuple(np.rint(self.images[stars]).astype(int).T)
+        own, beside = light[at], _around(light)[at]
+        usable = whole[at] & (own > 0.0)
+        if usable.sum() < FEWEST:
+            return none
+        share = SHARP * float(np.quantile(beside[usable] / own[usable], SHARPEST))
+        missing, more = share * here - _around(here), share * np.abs(here)
+        variance = _around(self.variance) + more + share * (share * self.variance + more)
+        theirs = light - here
+        sharp = (missing > SIGNIFICANCE * np.sqrt(variance)) & (here > BRIGHTER * theirs)
+        return np.asarray(sharp & whole)
+
+    def _brightest(self) -> Ints:
+        """The brightest third of the stars in the frame, at least 5."""
+        shape = np.array(self.residual.shape)
+        inside = np.all((self.images > 0) & (self.images < shape - 1), axis=1)
+        order = np.flatnonzero(inside)[np.argsort(-self.flux[inside])]
+        return order[: max(len(order) // 3, 5)]
+
     def noise(self, variance: Floats) -> Floats:
         """Standard deviation of the filtered frame, for a variance of every pixel."""
-        valid = np.where(self.posterior.valid, variance, 0.0)
+        valid = np.where(self.valid, variance, 0.0)
         total = signal.fftconvolve(valid, self.square, mode="same")
         return np.asarray(np.sqrt(np.maximum(total, 1e-12 * total.max())))
 
     def _excess(self, found: Floats) -> Floats:
-        left = np.where(self.posterior.valid, self.residual - self.light(found), 0.0)
+        left = np.where(self.valid, self.residual - self.light(found), 0.0)
         return np.asarray(-ndimage.gaussian_laplace(left, self.width))
 
     def light(self, found: Floats) -> Floats:
@@ -180,9 +232,7 @@ class _Filtered:
     def _misfit(self, excess: Floats) -> Floats:
         """Share of a star's light that the PSF's misfit leaves, by distance from the star."""
         rings = int(FARTHEST * RINGS)
-        inside = np.all((self.images > 0) & (self.images < np.array(excess.shape) - 1), axis=1)
-        order = np.flatnonzero(inside)[np.argsort(-self.flux[inside])]
-        stars = order[: min(max(len(order) // 3, 5), STARS)]
+        stars = self._brightest()[:STARS]
         share = np.zeros((len(stars), rings))
         more = np.maximum(np.abs(excess) - 3.0 * self.sd, 0.0)  # than noise
         reach = int(np.ceil(FARTHEST * self.width))
@@ -240,7 +290,7 @@ class _Filtered:
         limit = SIGNIFICANCE * self.sd + SIGNIFICANCE**2 / self.area
         peak = np.zeros(excess.shape, bool)
         inner = slice(int(np.ceil(self.width)), -int(np.ceil(self.width)))  # the edge is mirrored
-        peak[inner, inner] = (self.posterior.valid & (excess > limit))[inner, inner]
+        peak[inner, inner] = (self.valid & (excess > limit))[inner, inner]
         row, column = np.nonzero(peak & (excess == ndimage.maximum_filter(excess, size)))
         places = np.stack([row, column], axis=1).astype(np.float64)
         above = excess[row, column] - limit[row, column]
