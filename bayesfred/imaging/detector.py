@@ -21,8 +21,6 @@ from scipy.special import sici
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.kernels.contexts import PixelRule
-from bayesfred.imaging.pixel_rules import shared_rule
 from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 
@@ -31,7 +29,6 @@ PIXELS = ("impulse", "box")
 # Bound on the box rule's error along one axis. Up to pixels of 12 sigma the two axes together stay
 # below 6e-7 of the peak, even where the distortion narrows an image 1.3 times: see `_box_order`.
 BOX_TOLERANCE = 2e-8
-BOX_TOLERANCE_NARROWED = 3e-7  # along one axis, with the narrowed image
 
 # Most points along a pixel's side: the sum over their square would take too long.
 MOST_POINTS = 1000
@@ -153,29 +150,6 @@ class Detector:
         return np.asarray(nodes * half, dtype=np.float64), np.asarray(
             weights * half, dtype=np.float64
         )
-
-    def pixel_rule(self, sigma: float, beta: float = math.inf) -> PixelRule:
-        """Points and weights for images, fewer where neighbouring pixels can share them.
-
-        The error has the bounds of that of `quadrature`, whose points derivatives are sums over.
-
-        Parameters
-        ----------
-        sigma, beta : float
-            As in `quadrature`.
-
-        Returns
-        -------
-        PixelRule
-        """
-        offsets, weights = self.quadrature(sigma, beta)
-        side = float(self.binning)
-        rule = None
-        if self.pixel == "box":
-            rule = shared_rule(sigma / side, beta, BOX_TOLERANCE, BOX_TOLERANCE_NARROWED)
-        if rule is None or rule.offsets.size >= offsets.size:
-            return PixelRule(offsets, weights[None])
-        return PixelRule(side * rule.offsets, side * rule.weights, rule.shares)
 
 
 def _centred(n: int) -> Floats:

@@ -147,8 +147,9 @@ class ForwardModel:
         x, y = self.sources.x[:, None], self.sources.y[:, None]
         ny, nx = self.detector.shape
         width, beta = self.psf.core
-        width = width if narrowest is None else width * narrowest / self.psf.sigma
-        offsets, weights = self.detector.quadrature(width, beta)
+        offsets, weights = self.detector.quadrature(
+            width if narrowest is None else width * narrowest / self.psf.sigma, beta
+        )
         return Optics(
             psf=profile_of(self.psf, self.sources.x, self.sources.y, self.detector.binning),
             x=self.sources.x,
@@ -159,7 +160,6 @@ class ForwardModel:
             g_object_powers=np.ascontiguousarray(x ** g[:, 0] * y ** g[:, 1]),
             offsets=offsets,
             weights=weights,
-            rule=self.detector.pixel_rule(width, beta),
             step=float(self.detector.binning),
             ny=ny,
             nx=nx,

@@ -17,15 +17,6 @@ class Degrees(NamedTuple):
     d: tuple[int, ...]  # of D; empty where flux is not conserved
 
 
-class PixelRule(NamedTuple):
-    """How a recorded pixel is integrated along one axis, see `imaging/pixel_rules`."""
-
-    offsets: Floats  # (m,) of a pixel's own points from its centre
-    weights: Floats  # (2 reach + 1, m) of the points of the pixels before, in, and after it
-    # whether reach > 0; None, a type of its own, where not: nothing of that is compiled then
-    shares: Literal[True] | None = None
-
-
 class Optics(NamedTuple):
     """A forward model as the loops need it."""
 
@@ -36,9 +27,8 @@ class Optics(NamedTuple):
     g_powers: Ints
     f_object_powers: Floats  # (s, k) x^i y^j
     g_object_powers: Floats
-    offsets: Floats  # quadrature nodes of a pixel along one axis, fine pixel
+    offsets: Floats  # quadrature nodes of a pixel along one axis, pixel
     weights: Floats
-    rule: PixelRule  # the same for the image alone, which pixels may share samples of
     step: float  # pitch of the recorded pixels in fine pixels
     ny: int
     nx: int
@@ -96,15 +86,6 @@ class Footprints(NamedTuple):
     row: Ints  # the frame's row
 
 
-class Patch(NamedTuple):
-    """Rows of a source one after the other, each with room for what its neighbours need."""
-
-    every: tuple[int, int]  # all rows of the source, among those of the footprints
-    rows: tuple[int, int]  # those that are wanted
-    left: int  # the frame's column of a row's first pixel
-    pitch: int
-
-
 class Layout(NamedTuple):
     """The sources as they lie on the frame for one parameter vector."""
 
@@ -112,10 +93,8 @@ class Layout(NamedTuple):
     geometry: Geometry
     footprints: Footprints
     sigma: float  # the PSF's width, pixel
-    # a row's polynomials: of p, D, a, b, a_v, b_v, and one to spare; two rows of pixels
-    work: Floats
+    work: Floats  # a row's polynomials: of p, D, a, b, a_v, b_v, and one to spare
     places: Any  # room for what a PSF looks up, see `psf_dispatch`
-    patch: Floats  # room for the samples of a source whose pixels share them
 
 
 class Canvas(NamedTuple):

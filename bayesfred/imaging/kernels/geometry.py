@@ -18,13 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
+from bayesfred.imaging.kernels.compilation import entry, inner, shared
 from bayesfred.imaging.kernels.contexts import (
     LANES,
     Footprints,
     Geometry,
     Layout,
-    Patch,
     Source,
     SourceNuisances,
 )
@@ -62,7 +61,7 @@ def new_work(o):
     return np.empty((7, 2 * len(o.degrees.ab) + 1))
 
 
-@inner(inline="always")
+@inner()
 def one_source(geometry, s):
     """Source s alone."""
     u, v = geometry.peak[s, 0], geometry.peak[s, 1]
@@ -326,36 +325,10 @@ def row_starts(fp, pitch):
     return at
 
 
-@leaf()
-def find_patch(o, fp, s, rows):
-    """Where rows of a source, from rows[0] to rows[1] - 1 of the footprints, lie in a patch."""
-    every, left, right = (fp.first[s], fp.first[s + 1]), o.nx, 0
-    for i in range(every[0], every[1]):
-        left, right = min(left, fp.low[i]), max(right, fp.low[i] + fp.size[i])
-    # what lies beyond the frame's borders is needed there; beside other pixels it is too faint
-    left -= LANES if left == 0 else 0
-    right += LANES if right >= o.nx else 0
-    return Patch(every, rows, left, -(-(right - left) // LANES) * LANES + LANES)
-
-
-@inner()
-def _new_patch(shares, o, fp):
-    """Room for what `render` makes of a source: light, a filtered column of samples, samples."""
-    if shares is None:
-        return np.empty(0)
-    reach, m, largest = o.rule.weights.shape[0] // 2, o.rule.weights.shape[1], 0
-    for s in range(fp.first.size - 1):
-        rows = fp.first[s], fp.first[s + 1]
-        room = (rows[1] - rows[0] + 2 * reach) * find_patch(o, fp, s, rows).pitch + 2 * LANES
-        largest = max(largest, room)
-    return np.empty((m * m + 2) * largest)
-
-
 @inner()
 def layout_of(o, geometry, fp, sigma):
     """The sources as they lie on the frame, their footprints known."""
-    places = new_places(o.psf, o.ramp.size)
-    return Layout(o, geometry, fp, sigma, new_work(o), places, _new_patch(o.rule.shares, o, fp))
+    return Layout(o, geometry, fp, sigma, new_work(o), new_places(o.psf, o.ramp.size))
 
 
 @inner()
