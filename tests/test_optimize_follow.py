@@ -147,6 +147,18 @@ def test_hot_pixels_are_no_sources_though_stars_are_undersampled() -> None:
     assert not none.sharp.any() and "sharper" not in none.message
 
 
+def test_rings_of_defocused_stars_are_no_hot_pixels() -> None:
+    rng = np.random.default_rng(3)
+    x = np.arange(-48, 49) / 4.0
+    ring = np.exp(-((np.hypot(x, x[:, None]) - 3.0) ** 2) / (2.0 * 0.7**2))
+    model = planted.camera(planted.field(3), psf=bf.SampledPSF(ring, 4))
+    counts = rng.poisson(model.expected_counts(planted.THETA, planted.LEVEL))
+    nuisances = bf.Nuisances("free", offset=True, psf_sigma=True, footprint=9.0)
+    rough = replace(model, psf=bf.GaussianPSF(2.5))
+    found = looked(bf.Posterior(rough, counts, nuisances=nuisances))
+    assert not found.sharp.any()
+
+
 @pytest.mark.statistics
 def test_wings_of_the_psf_are_no_companions() -> None:
     """Moffat images fitted with a Gaussian leave a ring around every bright star."""

@@ -13,10 +13,11 @@ common: the 75 % quantile of the bright stars'. Where such peaks stand near more
 it is the PSF still, and the share is doubled until they do not.
 
 Light that is sharper than the stars' is no source but a hot pixel or a cosmic ray. What the eight
-pixels beside a star's middle hold of what that pixel holds is least where its image is in the
+pixels beside a star's brightest hold of what that one holds is least where the image is in the
 middle of the pixel: rho, the 10 % quantile of the bright stars'. A pixel with less than half of rho
-beside it, by 5 standard deviations, and more light than the stars have there, is masked by itself
-before anything is filtered. Where no test can tell, it counts as a source.
+beside it, and less than its own light, by 5 standard deviations, and more light than the stars have
+there, is masked by itself before anything is filtered. Where no test can tell, it counts as a
+source.
 
 A catalogued source that would keep less than half of its light says little but where it might be:
 behind the mask, as bright as can be. It is left out with all of its pixels.
@@ -45,6 +46,7 @@ LOOKS = 5  # for peaks, also for those hidden by others
 NAMED = 10  # sources in the message
 SHARPEST, FEWEST = 0.1, 5  # quantile of the bright stars' images, and how many tell it
 SHARP = 0.5  # of what these have beside their middle
+MOST_BESIDE = 1.0  # whatever the stars have: more is no single pixel's light
 BRIGHTER = 1.0  # than the stars' light there is a sharp pixel: less may be the PSF's misfit
 LEFT = 0.5  # share of its light that a source must keep, or it is left out with the light beside it
 
@@ -190,17 +192,28 @@ class _Filtered:
         light, here = (
             np.where(valid, image, 0.0) for image in (self.posterior.counts - level, self.residual)
         )
-        at = tuple(np.rint(self.images[stars]).astype(int).T)
+        at = self._peaks(light, self.images[stars])
         own, beside = light[at], _around(light)[at]
         usable = whole[at] & (own > 0.0)
         if usable.sum() < FEWEST:
             return none
-        share = SHARP * float(np.quantile(beside[usable] / own[usable], SHARPEST))
+        sharpest = float(np.quantile(beside[usable] / own[usable], SHARPEST))
+        share = min(SHARP * sharpest, MOST_BESIDE)
         missing, more = share * here - _around(here), share * np.abs(here)
         variance = _around(self.variance) + more + share * (share * self.variance + more)
         theirs = light - here
         sharp = (missing > SIGNIFICANCE * np.sqrt(variance)) & (here > BRIGHTER * theirs)
         return np.asarray(sharp & whole)
+
+    def _peaks(self, light: Floats, images: Floats) -> tuple[Ints, Ints]:
+        """The brightest pixels of images, which may be rings."""
+        reach = int(np.ceil(2.0 * self.width))
+        offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1) - reach
+        some = np.rint(images).astype(int).T[:, :, None] + offsets[:, None]
+        row, column = (np.clip(k, 0, n - 1) for k, n in zip(some, light.shape, strict=True))
+        best = light[row, column].argmax(axis=1)[:, None]
+        row, column = (np.take_along_axis(k, best, axis=1)[:, 0] for k in (row, column))
+        return row, column
 
     def _brightest(self) -> Ints:
         """The brightest third of the stars in the frame, at least 5."""
