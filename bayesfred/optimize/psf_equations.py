@@ -311,7 +311,7 @@ class PsfEquations:
             if float(measured @ measured) < STILL:
                 break
             points.append((np.log(state.strengths), off, measured))
-            with np.errstate(invalid="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore"):
                 rate = np.clip(np.nan_to_num(accelerated(points) / off, nan=1.0), *RATES)
             change = np.clip(rate * off, -FASTEST, FASTEST)
             strengths = np.clip(state.strengths * np.exp(change), *LIMITS)

@@ -15,9 +15,8 @@ it is the PSF still, and the share is doubled until they do not.
 Light that is sharper than the stars' is no source but a hot pixel or a cosmic ray. What the eight
 pixels beside a star's brightest hold of what that one holds is least where the image is in the
 middle of the pixel: rho, the 10 % quantile of the bright stars'. A pixel with less than half of rho
-beside it, and less than its own light, by 5 standard deviations, and more light than the stars have
-there, is masked by itself before anything is filtered. Where no test can tell, it counts as a
-source.
+beside it, and less than its own light, by 5 standard deviations, is masked by itself before
+anything is filtered. Where no test can tell, it counts as a source.
 
 A catalogued source that would keep less than half of its light says little but where it might be:
 behind the mask, as bright as can be. It is left out with all of its pixels.
@@ -47,7 +46,6 @@ NAMED = 10  # sources in the message
 SHARPEST, FEWEST = 0.1, 5  # quantile of the bright stars' images, and how many tell it
 SHARP = 0.5  # of what these have beside their middle
 MOST_BESIDE = 1.0  # whatever the stars have: more is no single pixel's light
-BRIGHTER = 1.0  # than the stars' light there is a sharp pixel: less may be the PSF's misfit
 LEFT = 0.5  # share of its light that a source must keep, or it is left out with the light beside it
 
 
@@ -148,11 +146,6 @@ def _message(u: Floats, v: Floats, photons: Floats, hidden: Ints) -> str:
     return f"{n} source{'s' * (n > 1)} that the catalogue lacks: {places}{more}{lost}"
 
 
-def _around(image: Floats) -> Floats:
-    """The sum over the eight pixels around every one."""
-    return np.asarray(9.0 * ndimage.uniform_filter(image, 3, mode="constant") - image)
-
-
 class _Filtered:
     """A frame without what its model explains, filtered."""
 
@@ -173,7 +166,7 @@ class _Filtered:
         self.flux = posterior.fluxes(params)
         seen = np.isfinite(images).all(axis=1) & np.isfinite(self.flux)
         self.rows, self.images, self.flux = np.flatnonzero(seen), images[seen], self.flux[seen]
-        self.sharp = self._sharp(posterior.likelihood.background(params))
+        self.sharp = self._sharp()
         self.valid = posterior.valid & ~self.sharp
         reach = 2 * int(np.ceil(4.0 * self.width)) + 1
         delta = np.zeros((reach, reach))
@@ -182,28 +175,25 @@ class _Filtered:
         self.sd = self.noise(self.variance)
         self.misfit = self._misfit(self._excess(np.zeros((0, 3))))
 
-    def _sharp(self, level: Floats) -> Flags:
-        """Pixels that hold light sharper than the stars'; `level` is the background."""
-        none, stars = np.zeros(level.shape, bool), self._brightest()
-        if len(stars) < FEWEST:
-            return none
-        valid = self.posterior.valid
-        whole = ndimage.minimum_filter(valid, 3, mode="constant", cval=False)
-        light, here = (
-            np.where(valid, image, 0.0) for image in (self.posterior.counts - level, self.residual)
-        )
-        at = self._peaks(light, self.images[stars])
-        own, beside = light[at], _around(light)[at]
-        usable = whole[at] & (own > 0.0)
+    def _sharp(self) -> Flags:
+        """Pixels that hold light sharper than the stars'."""
+        valid, stars = self.posterior.valid, self._brightest()
+        whole = ndimage.minimum_filter(valid, 5, mode="constant", cval=False)
+        # not the residual, which a wrong PSF makes sharp; above the 16 pixels farther out, so that
+        # no background is needed, and their share of the variance
+        counts = np.where(valid, self.posterior.counts, 0.0)
+        nine = 9.0 * ndimage.uniform_filter(counts, 3)
+        level = (25.0 * ndimage.uniform_filter(counts, 5) - nine) / 16.0
+        own, beside = counts - level, nine - counts - 8.0 * level
+        at = self._peaks(own, self.images[stars])
+        usable = whole[at] & (own[at] > 0.0)
         if usable.sum() < FEWEST:
-            return none
-        sharpest = float(np.quantile(beside[usable] / own[usable], SHARPEST))
+            return np.zeros(valid.shape, bool)
+        sharpest = float(np.quantile((beside[at] / np.abs(own[at]))[usable], SHARPEST))
         share = min(SHARP * sharpest, MOST_BESIDE)
-        missing, more = share * here - _around(here), share * np.abs(here)
-        variance = _around(self.variance) + more + share * (share * self.variance + more)
-        theirs = light - here
-        sharp = (missing > SIGNIFICANCE * np.sqrt(variance)) & (here > BRIGHTER * theirs)
-        return np.asarray(sharp & whole)
+        variance = (12.0 + share**2) * self.variance + share * (1.0 + share) * np.abs(own)
+        missing = share * own - np.maximum(beside, 0.0)
+        return np.asarray(whole & (missing > SIGNIFICANCE * np.sqrt(variance)))
 
     def _peaks(self, light: Floats, images: Floats) -> tuple[Ints, Ints]:
         """The brightest pixels of images, which may be rings."""
