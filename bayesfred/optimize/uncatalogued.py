@@ -13,7 +13,7 @@ common: the 75 % quantile of the bright stars'. Where such peaks stand near more
 it is the PSF still, and the share is doubled until they do not.
 
 Light that is sharper than the stars' is no source but a hot pixel or a cosmic ray. What the eight
-pixels beside a star's brightest hold of what that one holds is least where the image is in the
+pixels beside a star's middle one hold of what that one holds is least where the image is in the
 middle of the pixel: rho, the 10 % quantile of the bright stars'. A pixel with less than half of rho
 beside it, and less than its own light, by 5 standard deviations, is masked by itself before
 anything is filtered. Where no test can tell, it counts as a source.
@@ -185,7 +185,7 @@ class _Filtered:
         nine = 9.0 * ndimage.uniform_filter(counts, 3)
         level = (25.0 * ndimage.uniform_filter(counts, 5) - nine) / 16.0
         own, beside = counts - level, nine - counts - 8.0 * level
-        at = self._peaks(own, self.images[stars])
+        at = tuple(np.rint(self.images[stars]).astype(int).T)
         usable = whole[at] & (own[at] > 0.0)
         if usable.sum() < FEWEST:
             return np.zeros(valid.shape, bool)
@@ -194,16 +194,6 @@ class _Filtered:
         variance = (12.0 + share**2) * self.variance + share * (1.0 + share) * np.abs(own)
         missing = share * own - np.maximum(beside, 0.0)
         return np.asarray(whole & (missing > SIGNIFICANCE * np.sqrt(variance)))
-
-    def _peaks(self, light: Floats, images: Floats) -> tuple[Ints, Ints]:
-        """The brightest pixels of images, which may be rings."""
-        reach = int(np.ceil(2.0 * self.width))
-        offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1) - reach
-        some = np.rint(images).astype(int).T[:, :, None] + offsets[:, None]
-        row, column = (np.clip(k, 0, n - 1) for k, n in zip(some, light.shape, strict=True))
-        best = light[row, column].argmax(axis=1)[:, None]
-        row, column = (np.take_along_axis(k, best, axis=1)[:, 0] for k in (row, column))
-        return row, column
 
     def _brightest(self) -> Ints:
         """The brightest third of the stars in the frame, at least 5."""
