@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner, shared
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import (
     LANES,
     Footprints,
@@ -61,7 +61,7 @@ def new_work(o):
     return np.empty((7, 2 * len(o.degrees.ab) + 1))
 
 
-@inner()
+@inner(inline="always")
 def one_source(geometry, s):
     """Source s alone."""
     u, v = geometry.peak[s, 0], geometry.peak[s, 1]
@@ -78,7 +78,7 @@ def some_sources(geometry, first, last):
     return Geometry(a, b, q, d, peak, ellipse, rows, geometry.first + first)
 
 
-@inner()
+@leaf()
 def _fill(o, s, theta, nuisances, a, b):
     """Coefficients of a and b of source s in powers of u and v, about the frame's middle."""
     a[:] = 0.0
@@ -94,7 +94,7 @@ def _fill(o, s, theta, nuisances, a, b):
         b[o.g_powers[k, 0], o.g_powers[k, 1]] += theta[n_f + k] * o.g_object_powers[s, k]
 
 
-@inner()
+@leaf()
 def _find_peak(o, s, theta, nuisances, a, b):
     """Newton's iteration for a = b = 0, leaving a and b expanded about the solution.
 
@@ -129,7 +129,7 @@ def _find_peak(o, s, theta, nuisances, a, b):
     return u, v, found and a[1, 0] * b[0, 1] - a[0, 1] * b[1, 0] > 0.0
 
 
-@inner()
+@leaf()
 def _support_radius(o, source, search):
     """Radius R' of the ellipse |J d| <= R' that holds every pixel with |(a, b)| <= R = radius.
 
@@ -171,7 +171,7 @@ def _support_radius(o, source, search):
     return largest_d + margin if largest_d >= 0.0 else -1.0
 
 
-@inner()
+@leaf()
 def _rest(bounds, d):
     """rho at distance d."""
     rest = 0.0
@@ -180,7 +180,7 @@ def _rest(bounds, d):
     return rest * d
 
 
-@inner()
+@leaf()
 def _survey(o, source, search):
     """A bound of |J d| in the frame where |(a, b)| <= radius; -1 if D <= 0 where it is <= core.
 
@@ -233,7 +233,6 @@ def locate(o, theta, nuisances, geometry):
     one. Windows hold the pixels above the tolerance, and those above it once a source moves by as
     much in (a, b) as positions scatter.
     """
-    unfolded = True
     sigma = nuisances.psf_sigma
     search = _Search(
         sigma * o.support_radius + SCATTER * nuisances.position_scatter,
@@ -241,7 +240,12 @@ def locate(o, theta, nuisances, geometry):
         np.empty(2 * len(o.degrees.ab) + 1),
         np.empty((256, 3)),
     )
-    rows, ellipse = geometry.rows, geometry.ellipse
+    return _locate_sources(o, theta, nuisances, geometry, search)
+
+
+@leaf()
+def _locate_sources(o, theta, nuisances, geometry, search):
+    unfolded, rows, ellipse = True, geometry.rows, geometry.ellipse
     for s in range(o.x.size):
         a = geometry.a[s]
         b = geometry.b[s]

@@ -11,15 +11,18 @@ and for -p_a in place of p the same with -f' and f'' in place of f and -f'. Temp
 template 1 is -p_a and template 2 is -p_b.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba.core.types import NoneType  # type: ignore[attr-defined]
+from numba.extending import overload
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import inner, shared
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import one_source
-from bayesfred.imaging.kernels.psf_dispatch import by_type, psf_line
+from bayesfred.imaging.kernels.psf_dispatch import INLINED, by_type, psf_line
 
 
 class Lines(NamedTuple):
@@ -88,10 +91,9 @@ def _set_line(line, factor, out):
 
 
 @shared()
-def add_product(lines, fp, rows, flux, canvas, alone):
-    """Do what `render.add_source` does; False without lines."""
-    if lines is None:
-        return False
+def add_product(layout, s, rows, flux, canvas, alone):
+    """Do what `render.add_source` does."""
+    lines, fp = _product_lines(layout, s, rows[0], rows[1]), layout.footprints
     f, top, low, out, at = lines.rows[0], lines.top, lines.low, canvas.image, canvas.at
     lows, sizes, js = fp.low, fp.size, fp.row
     for i in range(rows[0], rows[1]):
@@ -100,7 +102,6 @@ def add_product(lines, fp, rows, flux, canvas, alone):
         _add_line(line, factor, out[at[i] : at[i] + n])
         if alone is not None:
             _set_line(line, factor, alone.image[alone.at[i] : alone.at[i] + n])
-    return True
 
 
 @shared()
@@ -216,3 +217,19 @@ def lines_of(translates, psf, layout, s, first, last):
     if translates is None:
         return None
     return _some_lines(psf, layout, s, first, last)
+
+
+def by_image(product: Callable[..., Any], sampled: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of a layout that has another code where images are products."""
+
+    def function(layout: Any, *others: Any) -> Any:
+        raise NotImplementedError("for compiled code")
+
+    @overload(function, INLINED, inline="always", strict=False)
+    def choose(layout: Any, *others: Any) -> Any:
+        optics = layout[layout.fields.index("optics")]
+        translates, psf = (optics[optics.fields.index(name)] for name in ("translates", "psf"))
+        is_product = not isinstance(translates, NoneType) and hasattr(psf.instance_class, "line")
+        return product if is_product else sampled
+
+    return function

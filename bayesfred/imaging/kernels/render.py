@@ -4,7 +4,7 @@ On a row of pixels a^2 + b^2 and D are polynomials in u alone: a sample of a Gau
 two Horner sweeps and one exponential.
 """
 
-from bayesfred.imaging.kernels.compilation import entry, leaf, shared
+from bayesfred.imaging.kernels.compilation import entry, shared
 from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import (
@@ -19,6 +19,7 @@ from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
 from bayesfred.imaging.kernels.products import (
     add_product,
     add_product_templates,
+    by_image,
     lines_of,
 )
 from bayesfred.imaging.kernels.psf_dispatch import (
@@ -34,13 +35,14 @@ from bayesfred.imaging.kernels.psf_dispatch import (
 BATCH = 32
 
 
-@leaf(fastmath=FAST, error_model="numpy")
-def _add_rows(layout, source, psf, rows_and_flux, canvas, alone):
-    """Do what `add_source` does where there is no product."""
+@shared(_nrt=False, fastmath=FAST, error_model="numpy")
+def _add_samples(layout, s, rows, flux, canvas, alone):
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this
-    # function: a call costs more than a short row.
+    # function: a call costs more than a short row. It counts no references: threads count those to
+    # what they share in turn.
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
-    (rows, flux), places = rows_and_flux, layout.places
+    source, places = one_source(layout.geometry, s), layout.places
+    psf = psf_of_source(o.psf, source.number)
     d, u, v = source.d, source.u, source.v
     offsets, weights, step = o.offsets, o.weights, o.step
     lows, js, sizes = fp.low, fp.row, fp.size
@@ -65,25 +67,23 @@ def _add_rows(layout, source, psf, rows_and_flux, canvas, alone):
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
-                    value = psf_on_row(psf, t, n, work, degrees, places) * abs(j)
+                    value = psf_on_row(psf, t, n, work, degrees.ab, places) * abs(j)
                     row[n] += value
                     if alone is not None:
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)
 
 
-@shared(fastmath=FAST, error_model="numpy")
-def add_source(layout, s, rows, flux, canvas, alone):
-    """Add the rows of source s from rows[0] to rows[1], times its flux, to a canvas.
+def _add_by_samples(layout, s, rows, flux, canvas, alone):
+    _add_samples(layout, s, rows, flux, canvas, alone)
 
-    `alone` is None or a canvas where the source alone is left.
-    """
-    o, fp = layout.optics, layout.footprints
-    lines = lines_of(o.translates, o.psf, layout, s, rows[0], rows[1])
-    if add_product(lines, fp, rows, flux, canvas, alone):
-        return
-    source = one_source(layout.geometry, s)
-    psf = psf_of_source(o.psf, source.number)
-    _add_rows(layout, source, psf, (rows, flux), canvas, alone)
+
+def _add_by_product(layout, s, rows, flux, canvas, alone):
+    add_product(layout, s, rows, flux, canvas, alone)
+
+
+# Add the rows of source s from rows[0] to rows[1], times its flux, to a canvas. `alone` is None or
+# a canvas where the source alone is left.
+add_source = by_image(_add_by_product, _add_by_samples)
 
 
 @shared(fastmath=FAST, error_model="numpy")
@@ -132,7 +132,7 @@ def add_templates(layout, s, flux, stamps, wider):
                         row_s[n] += flux * (inverse * (a * k_a + b * k_b) - 2.0 * k) * abs(j)
 
 
-@shared()
+@shared(_nrt=False)
 def add_sources(layout, flux, canvas):
     """Add sources to a canvas, some rows of each at a time.
 

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner, shared
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import SEGMENT, Optics, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
@@ -117,7 +117,7 @@ def _mark_counted(frame, w):
                 w.span[j, 1] = max(w.span[j, 1], k)
 
 
-@inner()
+@leaf()
 def next_run(w, j, k):
     """The next marked stretch of row j at or after segment k, as segments [start, stop).
 
@@ -149,7 +149,7 @@ def clear(w):
             w.span[j, 1] = -1
 
 
-@inner()
+@leaf()
 def background_row(background, j, ny):
     """Coefficients of the background on row j in powers of u, which runs from -1 to 1."""
     v = (2 * j - ny + 1) / ny
@@ -157,7 +157,7 @@ def background_row(background, j, ny):
     return c0, background[1] + v * background[4], background[3]
 
 
-@inner()
+@inner(inline="always")
 def stretch(frame, background, j, first, image):
     """The pixels of row j from pixel `first` of the padded frame on, as many as in `image`."""
     low = first - j * (frame.values.size // frame.ny)
@@ -254,9 +254,15 @@ def log_likelihood(frame, w, parameters):
     What depends on the counts alone is left out.
     """
     noise, background = given(frame.noise, parameters), parameters.background
-    level = background[0]
-    pitch = frame.values.size // frame.ny
-    total = 0.0
+    total = _sum_marked(frame, noise, w, background)
+    rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
+    return -math.inf if total + rest < LIMIT else total + rest
+
+
+@leaf()
+def _sum_marked(frame, noise, w, background):
+    """Sum of the log-densities of the marked pixels."""
+    pitch, level, total = frame.values.size // frame.ny, background[0], 0.0
     for j in range(frame.ny):
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
@@ -269,5 +275,4 @@ def log_likelihood(frame, w, parameters):
                 slope_run(part, image)
             total += summed(noise, frame.values[a:b], light, image, level, (a, w.scratch))
             start, stop = next_run(w, j, stop)
-    rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
-    return -math.inf if total + rest < LIMIT else total + rest
+    return total
