@@ -34,6 +34,9 @@ MOST_EVALUATIONS = 300  # after which no more searches begin
 
 SECANTS = 10  # steps that correct the information
 LEAST_CURVATURE = 0.1  # of what is known already: less is damped
+# Standard deviations from the maximum within which the information changes less than it differs
+# from the curvature anyway: it is computed again where it is reported, or where it does not serve.
+KEPT = 3.0
 
 # A Newton step is followed by another if it gains this part of what it predicts.
 AS_PREDICTED = 0.1
@@ -102,14 +105,18 @@ def maximize(
     params, value, evaluations, taken = start, float(posterior.log_prob(start)), 0, 0
     low, high = posterior.support
     close_enough = CLOSE_ENOUGH if steps is None else NEAR
-    nearest, stalled = np.inf, 0
+    nearest, stalled, is_own = np.inf, 0, True
     points: deque[tuple[Floats, Floats]] = deque(maxlen=SECANTS + 1)
     while True:
         if information is None:
-            information = posterior.information(params)
+            information, is_own = posterior.information(params), True
         gradient = posterior.gradient(params)
         try:
             newton = _newton_step(posterior.support, params, gradient, information)
+            serves = close_enough < newton.distance < CLOSER * nearest
+            if not is_own and not (serves and evaluations < MOST_EVALUATIONS):
+                information, is_own = posterior.information(params), True
+                newton = _newton_step(posterior.support, params, gradient, information)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
             unknown = np.full_like(information, np.nan)
             return NewtonResult(params, value, unknown, np.inf, evaluations)
@@ -119,7 +126,6 @@ def maximize(
             with suppress(linalg.LinAlgError):
                 curvature = _corrected(information, points)
                 way = _newton_step(posterior.support, params, gradient, curvature)
-        information = None
         closer = newton.distance < CLOSER * nearest
         nearest, stalled = (newton.distance, 0) if closer else (nearest, stalled + 1)
         if (
@@ -129,22 +135,17 @@ def maximize(
             or taken == steps
         ):
             break
-        gain, taken = -np.inf, taken + 1
-        for fraction in 0.5 ** np.arange(10):
-            there = np.clip(params + fraction * way.step, low, high)
-            gain = float(posterior.log_prob(there)) - value
-            evaluations += 1
-            if newton.distance < NEAR and -UNNOTICED < gain <= 0.0:
-                # the gradient's root is the maximum: for a model error it is that of log_prob to
-                # some hundredths of a standard deviation only
-                params, value, gain = there, value + gain, way.predicted
-                break
-            if 0.0 < gain < np.inf:
-                params, value = there, value + gain
-                break
+        taken += 1
+        params, value, gain, fraction, spent = _advance(posterior, params, value, way, newton)
+        evaluations += spent
         gains = 0.0 < gain < np.inf
         predicted = way.predicted * fraction * (2.0 - fraction)
         if gains and (steps is not None or gain > AS_PREDICTED * predicted):
+            information = information if steps is None and newton.distance < KEPT else None
+            is_own = False
+            continue
+        information = None
+        if not is_own:
             continue
         if steps is not None:
             break
@@ -157,6 +158,27 @@ def maximize(
             break
     log_prob = float(posterior.log_prob(params))
     return NewtonResult(params, log_prob, newton.covariance, newton.distance, evaluations)
+
+
+def _advance(
+    posterior: TargetDensity, params: Floats, value: float, way: _Step, newton: _Step
+) -> tuple[Floats, float, float, float, int]:
+    """Where the largest part of a step that gains leads, its value and gain, and the part.
+
+    At last how many log-posteriors that took. The parts are 1, 1/2, ... 1/512.
+    """
+    gain, fraction, evaluations = -np.inf, 1.0, 0
+    for fraction in 0.5 ** np.arange(10):
+        there = np.clip(params + fraction * way.step, *posterior.support)
+        gain = float(posterior.log_prob(there)) - value
+        evaluations += 1
+        if newton.distance < NEAR and -UNNOTICED < gain <= 0.0:
+            # the gradient's root is the maximum: for a model error it is that of log_prob to
+            # some hundredths of a standard deviation only
+            return there, value + gain, way.predicted, fraction, evaluations
+        if 0.0 < gain < np.inf:
+            return there, value + gain, gain, fraction, evaluations
+    return params, value, gain, fraction, evaluations
 
 
 def _newton_step(
