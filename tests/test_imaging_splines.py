@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+from bayesfred.imaging.kernels.contexts import Degrees
 from bayesfred.imaging.kernels.psf_dispatch import find_places, new_places
 from bayesfred.imaging.kernels.splines import (
     spline_cell,
@@ -69,7 +70,7 @@ def test_sums_are_scipys(function: Any, orders: list[tuple[int, int]]) -> None:
 @nb.njit
 def row_values(psf: Any, t0: Any, ramp: Any, work: Any) -> Any:
     places = new_places(psf, ramp.size)
-    find_places(psf, (t0, ramp, ramp.size), work, (0, 0), places)
+    find_places(psf, (t0, ramp, ramp.size), work, Degrees((0, 0), (), ()), places)
     return places[3][: ramp.size]
 
 

@@ -18,13 +18,15 @@ One that is a product, p = f(a) f(b), is faster where the map is a translation w
 
     line(psf, a)                     f, -f', f''
 
-One that has to look something up does so for all pixels of a row at once, and needs no `value`:
+One that has to look something up does so for all pixels of a row at once, and so does one for which
+two loops are faster than one. Neither needs a `value`:
 
     new_places(psf, width)              room for a row's places in the table
-    find_places(psf, pixels, work, degree, places)
-                                        fill it: a and b are the polynomials work[2] and work[3]
-                                        of that degree in t = t0 + ramp[n], n < size, and `pixels`
-                                        are (t0, ramp, size)
+    find_places(psf, pixels, work, degrees, places)
+                                        fill it: a and b are the polynomials work[2] and work[3] of
+                                        degree ab, or with a `radial_scale` z is work[0] of degree
+                                        q, in t = t0 + ramp[n], n < size; `pixels` are (t0, ramp,
+                                        size), `degrees` are the `Degrees` of `contexts`
     at_place(psf, places, n)            p in the row's pixel n
 
 A family that varies over the field has instead `of_source(psf, s)`: the compiled half of another
@@ -89,7 +91,7 @@ def _no_places(psf, width):
     return ()
 
 
-def _find_none(psf, pixels, work, degree, places):
+def _find_none(psf, pixels, work, degrees, places):
     pass
 
 
@@ -122,7 +124,9 @@ def _plane_on_row(psf, t, n, work, degrees, places):
 
 # Fill the rows 0, 2 and 3 of `work` with the polynomials on the row at v = v_peak + w, from which
 # `psf_on_row` makes p at u = u_peak + t, in the row's pixel n.
-fill_psf_row = by_type(lambda family: _fill_radial if hasattr(family, "radial") else _fill_plane)
+fill_psf_row = by_type(
+    lambda family: _fill_radial if hasattr(family, "radial_scale") else _fill_plane
+)
 new_places = by_type(lambda family: getattr(family, "new_places", _no_places))
 find_places = by_type(lambda family: getattr(family, "find_places", _find_none))
 rows_at_once = by_type(lambda family: _band if hasattr(family, "find_places") else _every_row)

@@ -61,13 +61,13 @@ def _add_samples(layout, s, rows, flux, canvas, alone):
             for x in range(offsets.size):
                 polynomial_on_row(d, w + offsets[y], norm * weights[y] * weights[x], rd, degrees.d)
                 t0 = t_low + offsets[x]
-                find_places(psf, (t0, ramp, row.size), work, degrees.ab, places)
+                find_places(psf, (t0, ramp, row.size), work, degrees, places)
                 for n in range(row.size):
                     t = t0 + ramp[n]
                     j = rd[d_top]
                     for m in range(d_top):
                         j = j * t + rd[d_top - 1 - m]
-                    value = psf_on_row(psf, t, n, work, degrees.ab, places) * abs(j)
+                    value = psf_on_row(psf, t, n, work, degrees, places) * abs(j)
                     row[n] += value
                     if alone is not None:
                         stamp[n] = value + (stamp[n] if x + y > 0 else 0.0)

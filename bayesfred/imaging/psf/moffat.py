@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.kernels.fastmath import LOG2_E, exp2, log
+from bayesfred.imaging.kernels.fastmath import exp2, log2
 from bayesfred.imaging.psf.protocol import FWHM
 from bayesfred.io.serialize import serializable
 
@@ -32,13 +32,28 @@ class MoffatProfile(NamedTuple):
         return 1.0 / psf.square
 
     @staticmethod
-    def radial(psf: Any, z: Any) -> Any:
-        return exp2(-LOG2_E * psf.beta * log(z + 1.0))
+    def new_places(psf: Any, width: Any) -> Any:
+        return np.empty(width)
+
+    @staticmethod
+    def find_places(psf: Any, pixels: Any, work: Any, degrees: Any, places: Any) -> Any:
+        # logarithms first: two short loops have more pixels in flight than a long one
+        (t0, ramp, size), r, top, power = pixels, work[0], len(degrees.q), -psf.beta
+        for n in range(size):
+            t = t0 + ramp[n]
+            z = r[top]
+            for m in range(top):
+                z = z * t + r[top - 1 - m]
+            places[n] = power * log2(z + 1.0)
+
+    @staticmethod
+    def at_place(psf: Any, places: Any, n: Any) -> Any:
+        return exp2(places[n])
 
     @staticmethod
     def slopes(psf: Any, a: Any, b: Any) -> Any:
         z = (a * a + b * b) * (1.0 / psf.square) + 1.0
-        p = exp2(-LOG2_E * psf.beta * log(z))
+        p = exp2(-psf.beta * log2(z))
         k = 2.0 * psf.beta / (psf.square * z) * p
         return p, k * a, k * b
 
@@ -46,7 +61,7 @@ class MoffatProfile(NamedTuple):
     def second_derivatives(psf: Any, a: Any, b: Any) -> Any:
         z = (a * a + b * b) * (1.0 / psf.square) + 1.0
         w = 2.0 * psf.beta / (psf.square * z)
-        k = w * exp2(-LOG2_E * psf.beta * log(z))
+        k = w * exp2(-psf.beta * log2(z))
         h = (1.0 + 1.0 / psf.beta) * w * k
         return k * a, k * b, h * a * a - k, h * a * b, h * b * b - k
 

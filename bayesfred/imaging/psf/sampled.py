@@ -73,10 +73,10 @@ class SplineProfile(NamedTuple):
         return new_spline_places(width)
 
     @staticmethod
-    def find_places(psf: Any, pixels: Any, work: Any, degree: Any, places: Any) -> Any:
+    def find_places(psf: Any, pixels: Any, work: Any, degrees: Any, places: Any) -> Any:
         # two loops: one would have more arrays than a compiler tells apart, and be no SIMD loop
         (t0, ramp, size), (at, y, x, p) = pixels, places
-        a, b, top, width = work[2], work[3], len(degree), psf.columns.size
+        a, b, top, width = work[2], work[3], len(degrees.ab), psf.columns.size
         c, columns, stride, scale = psf.phases, psf.columns, psf.stride, psf.scale
         pitch, far = -(-width // stride) * stride, 0.5 * (width - 1) - 1.5
         for n in range(size):
