@@ -116,7 +116,7 @@ def one_cluster(clusters, c, templates):
     return Group(clusters.members[a:b], clusters.lead[rows], clusters.start[rows])
 
 
-@inner()
+@leaf()
 def touch(boxes, s, t):
     """Whether two footprints may share pixels."""
     apart = (
@@ -128,7 +128,7 @@ def touch(boxes, s, t):
     return not apart
 
 
-@inner()
+@leaf()
 def run_end(fp, i, last, at):
     """The first of a source's rows after row i, before `last`, that does not continue the others.
 
@@ -156,7 +156,7 @@ def copy(values, out):
         out[i] = values[i]
 
 
-@inner()
+@leaf()
 def add_overlap(touching, pair, weight, at, rows, block):
     """block[m, n] += sum over the pixels that sources s and t share of weight T_sm T_tn.
 
@@ -178,7 +178,7 @@ def add_overlap(touching, pair, weight, at, rows, block):
                     block[m, n] += dot(left, stamps[n, qs + a : qs + b], part)
 
 
-@inner()
+@leaf()
 def shared_rows(touching, s, t):
     """The first row that two footprints share, and the one after the last."""
     boxes = touching.boxes
@@ -221,14 +221,14 @@ def gram(touching, group, weight, at, out):
                     copy(block[m], out[row : row + size])
 
 
-@inner()
+@leaf()
 def shift_prior(shift, scatter):
     """Rho and k of a source's shift, see `fluxes.py`."""
     ratio = (shift[0] ** 2 + shift[1] ** 2) / (DOF * scatter**2)
     return ratio, (DOF + 2.0) / (DOF * scatter**2 * (1.0 + ratio))
 
 
-@inner()
+@leaf()
 def bend_prior(shift, scatter):
     """What -d^2 log p of a shift has beyond its share in H: dx dx, dx dy and dy dy."""
     ratio, k = shift_prior(shift, scatter)
@@ -236,7 +236,7 @@ def bend_prior(shift, scatter):
     return more + c * shift[0] ** 2, c * shift[0] * shift[1], more + c * shift[1] ** 2
 
 
-@shared()
+@shared(_nrt=False)
 def add_prior(h, group, prior, fluxes, shifts, share):
     """Add the priors' curvature to H: a/F^2 for a flux, a share of k for a shift."""
     size = 3 if prior.scatter > 0.0 else 1
@@ -248,7 +248,7 @@ def add_prior(h, group, prior, fluxes, shifts, share):
             h[group.start[i] + i] += share * shift_prior(shifts[s], prior.scatter)[1]
 
 
-@inner()
+@leaf()
 def add_block(i, start, out, block):
     """Add second derivatives to a source's own block of a matrix.
 
@@ -262,7 +262,7 @@ def add_block(i, start, out, block):
     out[row[1] + column + 2] += block[4]
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _inner(a, b):
     total = 0.0
     for i in range(a.size):
@@ -270,7 +270,7 @@ def _inner(a, b):
     return total
 
 
-@shared()
+@shared(_nrt=False)
 def cholesky(h, group):
     """Lower triangle in place; False where the matrix is not positive definite."""
     lead, start = group.lead, group.start
@@ -288,7 +288,7 @@ def cholesky(h, group):
     return True
 
 
-@shared()
+@shared(_nrt=False)
 def solve(lower, group, x):
     """x <- (L L^T)^-1 x, in place."""
     lead, start = group.lead, group.start
@@ -302,7 +302,7 @@ def solve(lower, group, x):
             x[m] -= lower[at + m] * x[i]
 
 
-@inner()
+@leaf()
 def add_template(fp, rows, template, amplitude, canvas):
     """Add amplitude times rows of one of a source's templates, shape (samples,), to a canvas."""
     at, out, i = canvas.at, canvas.image, rows[0]
@@ -315,7 +315,7 @@ def add_template(fp, rows, template, amplitude, canvas):
         i = end
 
 
-@inner()
+@leaf()
 def project(fp, s, template, image, at):
     """Sum over a source's pixels of one of its templates times an image."""
     total = 0.0

@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import inner, shared
+from bayesfred.imaging.kernels.compilation import inner, leaf, shared
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.clusters import run_end, touch
 
@@ -62,7 +62,7 @@ class Slopes(NamedTuple):
     mixed: Floats  # (pairs, 6) b_11, b_21, b_12, b_31, b_22, b_13
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def own_run(light, weight, ratio, sums):
     """Add the samples of a source's T to N_20, N_30 and N_40."""
     n2, n3, n4 = sums
@@ -74,7 +74,7 @@ def own_run(light, weight, ratio, sums):
     return n2, n3, n4
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def shared_run(left, right, weight, ratio, sums):
     """Add the samples of two sources' T to N_11, N_21, N_12, N_31, N_22 and N_13."""
     n11, n21, n12, n31, n22, n13 = sums

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Flags, Floats, Ints
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf
 from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, row_starts
@@ -99,7 +99,7 @@ def describe(profiled, fluxes, z):
     return diagonal, first, last, other[:n], place[:n], slope
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _own_row(templates, i, score, weight, j, n):
     """Sums of template times score and template squared times weight, n samples from i, j on."""
     g, h = 0.0, 0.0
@@ -109,7 +109,7 @@ def _own_row(templates, i, score, weight, j, n):
     return g, h
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _shared_row(templates, i, m, weight, j, n):
     """Sum of two templates' product times weight, n samples from i, m and j on."""
     total = 0.0
@@ -118,7 +118,7 @@ def _shared_row(templates, i, m, weight, j, n):
     return total
 
 
-@inner()
+@leaf()
 def _multiply_band(w, visit, top, last):
     """Add what a band's pixels give to g and H."""
     fp, boxes, known, h = visit.layout.footprints, visit.boxes, visit.known, visit.h
@@ -162,13 +162,12 @@ def _multiply_band(w, visit, top, last):
                 visit.mixed[e, m] += products[m]
 
 
-@inner()
-def _sum_up(frame, w, parameters, visit, fluxes):
+@leaf()
+def _sum_up(frame, given_noise, w, visit, fluxes, expanded):
     """Render the sources with these fluxes and sum g and H, without the prior's share."""
     layout, boxes, place = visit.layout, visit.boxes, visit.templates.at
-    fp, noise = layout.footprints, given(frame.noise, parameters)
+    fp, (noise, background) = layout.footprints, given_noise
     visit.g[:] = 0.0
-    expanded = np.any(visit.faint)
     visit.h[:] = 0.0
     visit.own[:] = 0.0
     visit.mixed[:] = 0.0
@@ -184,7 +183,7 @@ def _sum_up(frame, w, parameters, visit, fluxes):
                 place[i] = used + fp.start[i] - fp.start[p]
             used += fp.start[q] - fp.start[p]
             add_source(layout, s, (p, q), fluxes[s], visit.canvas, visit.templates)
-        rows = parameters.background, (top, last)
+        rows = background, (top, last)
         if expanded:
             weigh_rows(frame, noise, w, rows, w.weight, w.ratio)
         else:
@@ -263,11 +262,12 @@ def profile_extrapolated(problem, w, parameters, fluxes, known):
         np.empty((fluxes.size, 3)),
         np.empty((known.other.size, 6)),
     )
-    scale = problem.flux / problem.shape
+    given_noise = given(frame.noise, parameters), parameters.background
+    scale, expanded = problem.flux / problem.shape, np.any(problem.faint)
     for i in range(VISITS):
         if i > 0:
             w.image[:] = 0.0
-        _sum_up(frame, w, parameters, visit, fluxes)
+        _sum_up(frame, given_noise, w, visit, fluxes, expanded)
         value, change = _newton(visit, clusters, problem.shape, scale, fluxes)
         if change < ENOUGH:
             value += _next_term(visit, problem.shape)

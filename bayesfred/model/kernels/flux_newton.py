@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import inner
+from bayesfred.imaging.kernels.compilation import inner, leaf
 from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.render import add_source, add_templates
@@ -62,7 +62,7 @@ class Cluster(NamedTuple):
     scale: Floats  # of the fluxes' Gamma prior, the catalogue's flux over the shape
 
 
-@inner()
+@leaf()
 def make_templates(cluster, s, flux):
     """Fill the templates of source s."""
     stamps, fp = cluster.touching.stamps, cluster.layout.footprints
@@ -75,7 +75,7 @@ def make_templates(cluster, s, flux):
         add_source(cluster.layout, s, (first, last), 1.0, canvas, None)
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _least_squares(cluster, s):
     """Sums over some of a source's rows of K times counts above the background, and of K^2."""
     fp, stamp, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
@@ -89,7 +89,7 @@ def _least_squares(cluster, s):
     return step * above, step * below
 
 
-@inner()
+@leaf()
 def start(cluster):
     """Templates, and the least-squares flux of every source, its neighbours ignored.
 
@@ -123,7 +123,7 @@ def _correct(cluster, lower, slopes, step):
         step[i] += more[i]
 
 
-@inner(error_model="numpy")
+@leaf(error_model="numpy")
 def _scale(cluster, lower, slopes, step):
     """Make Cholesky's factor of H that of D H D, before the step is taken."""
     group = cluster.group
@@ -133,7 +133,7 @@ def _scale(cluster, lower, slopes, step):
             lower[k] *= factor
 
 
-@inner()
+@leaf()
 def _rows(cluster, s, band):
     """Which of the footprints' rows are those of source s in a band of rows of the frame."""
     fp, box = cluster.layout.footprints, cluster.touching.boxes[s]
@@ -141,7 +141,7 @@ def _rows(cluster, s, band):
     return fp.first[s] + begin - box[0], fp.first[s] + max(end, begin) - box[0]
 
 
-@inner()
+@leaf()
 def _add_step(cluster, rows, step):
     """Add a step of a source's flux to rows of the image."""
     fp, stamp, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
@@ -152,7 +152,7 @@ def _add_step(cluster, rows, step):
             image[j + k] += step * stamp[i + k]
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _project(cluster, rows):
     """The sum of K times the score over rows of a source."""
     fp, stamp, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
@@ -164,7 +164,7 @@ def _project(cluster, rows):
     return total
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _moments(cluster, rows):
     """Sums of K times the score, of W K^2 and of C K^3 over rows of a source."""
     fp, stamp, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
@@ -181,7 +181,7 @@ def _moments(cluster, rows):
     return slope, square, cube
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _product(cluster, pair, rows):
     """The sum of W K_s K_t over rows first, first + step, ... of the frame, up to but for last."""
     fp, boxes, stamp = cluster.layout.footprints, cluster.touching.boxes, cluster.touching.stamps[0]
@@ -200,7 +200,7 @@ def _product(cluster, pair, rows):
     return total
 
 
-@inner()
+@leaf()
 def _add_pairs(cluster, near, band, h):
     """Add what a band gives to the elements of H off the diagonal, of pairs that are near."""
     touching, group = cluster.touching, cluster.group
@@ -214,7 +214,7 @@ def _add_pairs(cluster, near, band, h):
                 h[place] += _product(cluster, (s, group.members[k]), rows)
 
 
-@inner()
+@leaf()
 def _look(cluster, near, sums, h):
     """Estimate the elements of H off the diagonal, and find out which pairs are near."""
     touching, group = cluster.touching, cluster.group
@@ -267,7 +267,7 @@ def _visit(frame, parameters, cluster, step, kind, pairs):
     return sums
 
 
-@inner(error_model="numpy")
+@leaf(error_model="numpy")
 def _newton_step(cluster, sums, slopes, fresh, h, step):
     """Fill a Newton step; if `fresh`, H's diagonal from the sums, then its factor, and beta."""
     group, fluxes, prior = cluster.group, cluster.fluxes, cluster.prior
@@ -285,7 +285,7 @@ def _newton_step(cluster, sums, slopes, fresh, h, step):
     return True
 
 
-@inner(error_model="numpy")
+@leaf(error_model="numpy")
 def _largest(cluster, step):
     """The largest relative change that a step makes."""
     largest = 0.0

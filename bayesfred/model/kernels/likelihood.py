@@ -166,7 +166,7 @@ def stretch(frame, background, j, first, image):
     return Stretch(frame.values[first : first + image.size], image, first, c0, c1, c2, u, step)
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def weigh_run(noise, part, score, weight, ratio):
     """Score d log L/d mu and weight -d^2 log L/d mu^2 of a stretch, zero where masked.
 
@@ -187,7 +187,7 @@ def weigh_run(noise, part, score, weight, ratio):
             ratio[i] = c / w if counted and w > LEAST else 0.0
 
 
-@shared()
+@shared(_nrt=False)
 def weigh_rows(frame, noise, w, place, weights, ratios):
     """Score of the marked pixels of rows (first, last + 1), with the background there: `place`.
 
@@ -206,7 +206,7 @@ def weigh_rows(frame, noise, w, place, weights, ratios):
             start, stop = next_run(w, j, stop)
 
 
-@shared(fastmath=FAST)
+@shared(_nrt=False, fastmath=FAST)
 def slope_run(part, out):
     """The image of a stretch plus the part of the background that varies along it."""
     for i in range(out.size):

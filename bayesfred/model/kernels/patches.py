@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import inner, shared
+from bayesfred.imaging.kernels.compilation import leaf, shared
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.model.kernels.contexts import LIMIT
 from bayesfred.model.kernels.likelihood import room, stretch, weigh_run
@@ -53,7 +53,7 @@ def new_patch(w, touching, group, at):
     return Patch(top, low, start, image, w.score[:size], w.weight[:size], w.ratio[:size])
 
 
-@shared()
+@shared(_nrt=False)
 def weigh_patch(frame, noise, background, patch, rows, ratios):
     """Score and weight of rows of a patch; their ratios into `ratios` unless it is None."""
     for j in range(rows[0], rows[1]):
@@ -63,7 +63,7 @@ def weigh_patch(frame, noise, background, patch, rows, ratios):
         weigh_run(noise, part, patch.score[a:b], patch.weight[a:b], ratio)
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _excess_run(part, score, weight):
     for i in range(score.size):
         x = part.u + part.step * i
@@ -72,7 +72,7 @@ def _excess_run(part, score, weight):
         score[i], weight[i] = above if counted else 0.0, 1.0 if counted else 0.0
 
 
-@inner()
+@leaf()
 def fill_excess(frame, background, patch):
     """Counts less background in place of the score, and a weight of 1; both zero where masked."""
     for j in range(patch.first.size):
@@ -81,7 +81,7 @@ def fill_excess(frame, background, patch):
         _excess_run(part, patch.score[a:b], patch.weight[a:b])
 
 
-@shared(fastmath=FAST)
+@shared(_nrt=False, fastmath=FAST)
 def add_patch(patch, image):
     """Add a patch's image to that of the frame."""
     for j in range(patch.first.size):
