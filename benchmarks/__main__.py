@@ -271,6 +271,7 @@ def main() -> int:
                 ("read noise 2", bf.PoissonNoise(2.0)),
                 ("a map of read noises", bf.PoissonNoise(read_noises)),
                 ("a map below 1", bf.PoissonNoise(0.25 * read_noises)),
+                ("a map around 1", bf.PoissonNoise(0.5 * read_noises)),
                 ("a flat field", bf.FlatFieldNoise(bf.PoissonNoise(), flat)),
                 ("flat field, read noise 2", bf.FlatFieldNoise(bf.PoissonNoise(2.0), flat)),
                 ("flat field, a map", bf.FlatFieldNoise(bf.PoissonNoise(read_noises), flat)),

@@ -210,6 +210,8 @@ EXTREMES: dict[str, Any] = {
     "map": RNG.uniform(1.0, 3.0, WIDE),
     "a very noisy pixel": np.where(np.arange(1100) == 600, 1e6, 2.0) * np.ones(WIDE),
     "an almost noiseless pixel": np.where(np.arange(1100) == 600, 0.01, 2.0) * np.ones(WIDE),
+    "a map below 1": RNG.uniform(0.05, 0.95, WIDE),
+    "a map around 1": RNG.uniform(0.3, 3.0, WIDE),
 }
 
 

@@ -73,16 +73,21 @@ def exp2(x):
 
 
 @nb.njit(fastmath=FAST, inline="always")
+def split(x):
+    """k and m in [0.7, 1.41] of a positive normal number m 2^k."""
+    bits = as_bits(x)
+    k = (bits - 4604544271217802189) >> 52  # exponent, counted from sqrt(1/2)
+    return k, as_float(bits - (k << 52))
+
+
+@nb.njit(fastmath=FAST, inline="always")
 def log(x):
     """log(x) of a positive normal number to 3e-16 (absolute near 1).
 
-    The mantissa m in [0.7, 1.41] by bits, then 2 artanh(s) with s = (m - 1) / (m + 1): 2 s + 2 s^3
-    p(s^2), p being the polynomial of degree 6 nearest to 1/3 + z/5 + z^2/7 + ... (Remez, 5e-18 of
-    the result).
+    The mantissa m by bits, then 2 artanh(s) with s = (m - 1) / (m + 1): 2 s + 2 s^3 p(s^2), p being
+    the polynomial of degree 6 nearest to 1/3 + z/5 + z^2/7 + ... (Remez, 5e-18 of the result).
     """
-    bits = as_bits(x)
-    k = (bits - 4604544271217802189) >> 52  # exponent, counted from sqrt(1/2)
-    m = as_float(bits - (k << 52))
+    k, m = split(x)
     s = (m - 1.0) / (m + 1.0)
     z = s * s
     p = 7.3089406919315180756e-02

@@ -51,7 +51,7 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
     flags = np.zeros(size // SEGMENT, np.uint8)
     image, score, heap = map(_aligned, (size, size, more))
     weight, ratio = (score, _aligned(0)) if free is None else map(_aligned, (size, size))
-    scratch = _aligned(4 * STRETCH).reshape(4, STRETCH)
+    scratch = _aligned(5 * STRETCH).reshape(5, STRETCH)
     return Workspace(image, flags, span, score, weight, ratio, heap, scratch)
 
 
@@ -254,25 +254,26 @@ def log_likelihood(frame, w, parameters):
     What depends on the counts alone is left out.
     """
     noise, background = given(frame.noise, parameters), parameters.background
-    total = _sum_marked(frame, noise, w, background)
     rest, _, _ = unreached(noise, unreached_pixels(frame, w), background[0])
-    return -math.inf if total + rest < LIMIT else total + rest
+    total = rest + _sum_marked(frame, noise, w, background)
+    return -math.inf if total < LIMIT else total
 
 
 @leaf()
 def _sum_marked(frame, noise, w, background):
     """Sum of the log-densities of the marked pixels."""
-    pitch, level, total = frame.values.size // frame.ny, background[0], 0.0
+    pitch, total = frame.values.size // frame.ny, 0.0
     for j in range(frame.ny):
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             a, b = j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT
             light = w.image[a:b]
-            image = light
+            level, image = background[0], light
             if frame.varies:
                 part = stretch(frame, background, j, a, light)
                 level, image = part.c0, w.score[a:b]
                 slope_run(part, image)
-            total += summed(noise, frame.values[a:b], light, image, level, (a, w.scratch))
+            mean = (image, level, None)
+            total += summed(noise, frame.values[a:b], light, mean, (a, w.scratch))
             start, stop = next_run(w, j, stop)
     return total

@@ -14,11 +14,12 @@ model has
 
 These see a pixel outside the likelihood, too, as one with n = mu; what they return for it is not
 used. They must not branch where a loop shall vectorise. A model may have its own way to sum over
-whole segments of a row, the mean being image + level:
+whole segments of a row. There the mean is (image + level) response, or image + level if the
+response is None:
 
-    summed(noise, values, light, image, level, place)
-                                      the sum of log_density; `place` is the first pixel's, and the
-                                      `scratch` of the `Workspace`
+    summed(noise, values, light, mean, place)
+                                      the sum of log_density; `mean` is (image, level, response),
+                                      `place` the first pixel's, and the `scratch` of `Workspace`
 
 Where the background is constant, it may spare the loops the pixels that no source reaches:
 
@@ -41,11 +42,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
-from bayesfred.imaging.kernels.compilation import inner, leaf
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
+from bayesfred.imaging.kernels.compilation import leaf
+from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.psf_dispatch import by_type
-from bayesfred.model.kernels.contexts import LIMIT, STRETCH
+from bayesfred.model.kernels.contexts import LIMIT
 
 
 def _optional(name: str, default: Callable[..., Any]) -> Callable[..., Any]:
@@ -70,12 +73,40 @@ information = by_type(lambda family: family.information)
 unreached = _optional("unreached", _no_pixels)
 
 
+def scaled(mean: Any, response: Any, i: Any) -> Any:
+    """The mean times the response of pixel i, if there is one."""
+    raise NotImplementedError("for compiled code")
+
+
+@overload(scaled, inline="always", strict=False)
+def _choose_scaled(mean: Any, response: Any, i: Any) -> Any:
+    if isinstance(response, types.NoneType):
+        return lambda mean, response, i: mean
+    return lambda mean, response, i: mean * response[i]
+
+
+def part_of(mean: Any, first: Any, size: Any) -> Any:
+    """What `summed` calls `mean`, of some of the pixels."""
+    raise NotImplementedError("for compiled code")
+
+
+@overload(part_of, inline="always", strict=False)
+def _choose_part(mean: Any, first: Any, size: Any) -> Any:
+    if isinstance(mean[2], types.NoneType):
+        return lambda mean, first, size: (mean[0][first : first + size], mean[1], None)
+    return lambda mean, first, size: (
+        mean[0][first : first + size],
+        mean[1],
+        mean[2][first : first + size],
+    )
+
+
 @leaf(fastmath=REDUCE, error_model="numpy")
-def sum_pixels(noise, values, light, image, level, first):
+def sum_pixels(noise, values, light, mean, first):
     """Sum of the log-densities of the unmasked pixels of a stretch, one by one."""
-    total = 0.0
+    (image, level, response), total = mean, 0.0
     for i in range(image.size):
-        mu = image[i] + level
+        mu = scaled(image[i] + level, response, i)
         counted = values[i] > LIMIT
         n = values[i] if counted else mu
         term = log_density(noise, n, mu, light[i], np.uint64(first + i))
@@ -83,8 +114,8 @@ def sum_pixels(noise, values, light, image, level, first):
     return total
 
 
-def _pixel_by_pixel(noise, values, light, image, level, place):
-    return sum_pixels(noise, values, light, image, level, place[0])
+def _pixel_by_pixel(noise, values, light, mean, place):
+    return sum_pixels(noise, values, light, mean, place[0])
 
 
 def _exact(noise):
@@ -114,25 +145,3 @@ exact_weight = _optional("exact_weight", _exact)
 error_slopes = _optional("error_slopes", _no_slopes)
 error_information = _optional("error_information", _no_information)
 level_derivatives = _optional("level_derivatives", _no_derivatives)
-
-
-@leaf(fastmath=FAST)
-def _fill_means(image, level, response, out):
-    for i in range(out.size):
-        out[i] = (image[i] + level) * response[i]
-
-
-@inner(inline="always")
-def sum_scaled(noise, counts, mean, place):
-    """The sum of log_density over segments whose means (image, level, response) are scaled.
-
-    Counts and response are those of the whole frame.
-    """
-    (image, level, response), (first, scratch), total = mean, place, 0.0
-    for a in range(0, image.size, STRETCH):
-        part = image[a : a + STRETCH]
-        begin, mu = first + a, scratch[3, : part.size]
-        end = begin + part.size
-        _fill_means(part, level, response[begin:end], mu)
-        total += summed(noise, counts[begin:end], mu, mu, 0.0, (begin, scratch))
-    return total

@@ -48,12 +48,13 @@ from scipy.special import gammaln
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import inner
-from bayesfred.imaging.kernels.fastmath import FAST, LOG2_E, as_bits, as_float, exp2, log
+from bayesfred.imaging.kernels.fastmath import FAST, LOG2_E, exp2, log, split
 
-REACH = 8  # terms of the sum on either side of n
+REACH = 8  # terms of the sum on either side of n, see `photon_sum`
 WIDE = 1.0  # variance of the read noise from which on the saddlepoint expansion serves
 LEAST = 1e-30  # stands for smaller expected counts in the sum, whose powers must not underflow
 NEGLIGIBLE = 1e-25  # of successive terms, whose products shall not become denormal numbers
+FARTHEST = 35.0  # exponents of a step's factors: smaller ones than exp(-35) change no sum
 TINY = 1e-200  # ... and in the saddlepoint expansion
 
 # log phi + 1/2 log(2 pi v): coefficients of q^i rho^j, a row for i = 1, 2, 3, from j = 1 on
@@ -99,46 +100,78 @@ def _exp(x):
 
 
 @inner(fastmath=FAST, forceinline=True)
-def _nearest(n):
-    """The photon number that terms of the sum are relative to, and by how much n exceeds it."""
-    k = max(np.rint(n), 0.0)
-    return k, n - k
+def nearest(n):
+    """The photon number that terms of the sum are relative to."""
+    return max(np.rint(n), 0.0)
 
 
 @inner(fastmath=FAST, forceinline=True)
-def _steps(excess, inverse):
-    """Ratios of the Gaussians at one photon more, and at one less, to that at the nearest."""
-    up = _exp(min(excess - 0.5, 0.0) * inverse)
-    return up, _exp(min(-excess - 0.5, 0.0) * inverse), _exp(-inverse)
+def _factor(excess, inverse):
+    return _exp(min(max((excess - 0.5) * inverse, -FARTHEST), FARTHEST))
 
 
 @inner(fastmath=FAST, forceinline=True)
+def steps(n, inverse):
+    """Ratios of the Gaussians at one photon more, and at one less, to that at the nearest.
+
+    `inverse` is 1 / r^2. Each step farther multiplies the ratio of its Gaussians by their product
+    q = exp(-1 / r^2). Below zero, where no step leads to less, the second serves q alone.
+    """
+    excess = n - nearest(n)
+    return _factor(excess, inverse), _factor(-excess, inverse)
+
+
+@inner(fastmath=FAST, forceinline=True)
+def _above(k, step, series, common):
+    common *= k
+    return common + step * series, common
+
+
+@inner(fastmath=FAST, forceinline=True)
+def _sum_above(k, a, q):
+    """(k + 1) ... (k + 8) (1 + a / (k + 1) (1 + a q / (k + 2) (1 + ...))), and the product."""
+    q2, a2 = q * q, a * q
+    q4, a3, a4 = q2 * q2, a * q2, a2 * q2
+    series, common = _above(k + 8.0, a4 * q4, 1.0, 1.0)
+    series, common = _above(k + 7.0, a3 * q4, series, common)
+    series, common = _above(k + 6.0, a2 * q4, series, common)
+    series, common = _above(k + 5.0, a * q4, series, common)
+    series, common = _above(k + 4.0, a4, series, common)
+    series, common = _above(k + 3.0, a3, series, common)
+    series, common = _above(k + 2.0, a2, series, common)
+    return _above(k + 1.0, a, series, common)
+
+
+@inner(fastmath=FAST, forceinline=True)
+def _sum_below(k, mu, a, q):
+    """mu^8 a k / mu (1 + a q (k - 1) / mu (1 + ...)), and mu^8."""
+    q2, a2, mu2 = q * q, a * q, mu * mu
+    q4, a3, a4, mu4 = q2 * q2, a * q2, a2 * q2, mu2 * mu2
+    series = a4 * q4 * (k - 7.0)
+    series = (mu + series) * (a3 * q4 * (k - 6.0))
+    series = (mu2 + series) * (a2 * q4 * (k - 5.0))
+    series = (mu2 * mu + series) * (a * q4 * (k - 4.0))
+    series = (mu4 + series) * (a4 * (k - 3.0))
+    series = (mu4 * mu + series) * (a3 * (k - 2.0))
+    series = (mu4 * mu2 + series) * (a2 * (k - 1.0))
+    return (mu4 * mu2 * mu + series) * (a * k), mu4 * mu4
+
+
+@inner(fastmath=FAST, forceinline=True)
+def photon_sum(k, mu, up, down):
+    """The sum as a polynomial in mu: times mu^(k - 8) exp(-mu) it is p up to a factor of n."""
+    q = up * down
+    above, common = _sum_above(k, up * mu, q)
+    below, power = _sum_below(k, mu, down, q)
+    return power * above + common * below
+
+
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _sum_density(n, mu, variance):
     """log p of the sum, less what depends on n alone."""
-    mu = max(mu, LEAST)
-    k, excess = _nearest(n)
-    up, down, q = _steps(excess, 1.0 / variance)
-    # 1 + a / (k + 1) (1 + a q / (k + 2) (1 + ...)) over a common denominator
-    a = max(up * mu, NEGLIGIBLE)
-    above, common, power, step, fixed = 1.0, 1.0, 1.0, 1.0, 1.0
-    for j in range(1, REACH + 1):
-        power *= a
-        above = above * (k + j) + power * fixed
-        common *= k + j
-        step *= q
-        fixed = max(fixed * step, NEGLIGIBLE)  # q^(j (j + 1) / 2): the same for every pixel
-    # mu^REACH times down k / mu (1 + down q (k - 1) / mu (1 + ...))
-    a = max(down, NEGLIGIBLE)
-    below, power, step, fixed = 0.0, 1.0, 1.0, 1.0
-    for j in range(1, REACH + 1):
-        power *= a * (k - j + 1.0)
-        below = below * mu + power * fixed
-        step *= q
-        fixed = max(fixed * step, NEGLIGIBLE)
-    power = mu * mu
-    power *= power
-    power *= power
-    return (k - REACH) * log(mu) - mu + log(power * above + common * below)
+    k, mu = nearest(n), max(mu, LEAST)
+    up, down = steps(n, 1.0 / variance)
+    return (k - REACH) * log(mu) - mu + log(photon_sum(k, mu, up, down))
 
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
@@ -153,9 +186,9 @@ def _derivatives(mu, first, second, third):
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _sum_derivatives(n, mu, variance):
     """Score, weight and C of the sum."""
-    mu = max(mu, LEAST)
-    k, excess = _nearest(n)
-    up, down, q = _steps(excess, 1.0 / variance)
+    k, mu = nearest(n), max(mu, LEAST)
+    up, down = steps(n, 1.0 / variance)
+    q = up * down
     total, photons, first, second, third = 1.0, k, 0.0, 0.0, 0.0
     a, power, step, fixed = max(up * mu, NEGLIGIBLE), 1.0, 1.0, 1.0
     for j in range(1, REACH + 1):
@@ -188,9 +221,8 @@ def _sum_derivatives(n, mu, variance):
 @inner(fastmath=FAST, forceinline=True)
 def _rough_log(x):
     """log(x) of a positive normal number to 1e-4, without a division; see `fastmath.log`."""
-    bits = as_bits(x)
-    k = (bits - 4604544271217802189) >> 52
-    m = as_float(bits - (k << 52)) - 1.0
+    k, m = split(x)
+    m -= 1.0
     p = m * (0.99935223 + m * (-0.50246549 + m * (0.35871218 - m * 0.22848254)))
     return k * math.log(2.0) + p
 
@@ -211,10 +243,8 @@ def rougher_omega(x):
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def rough_omega(x, w):
-    """omega(x) to 2e-3, and 1 / (1 + omega) to 1 %: a step of Newton's method from w."""
-    known = 1.0 / (1.0 + w)
-    omega = max(w * (1.0 + x - _rough_log(w)) * known, 0.0)
-    return omega, known * (2.0 - (1.0 + omega) * known)
+    """omega(x) to 2e-3: a step of Newton's method from w."""
+    return max(w * (1.0 + x - _rough_log(w)) / (1.0 + w), 0.0)
 
 
 @inner(fastmath=FAST, forceinline=True)
@@ -223,28 +253,28 @@ def tilted_mean(mu, s):
     return mu * _exp(s)
 
 
-@inner(fastmath=FAST, forceinline=True)
-def improved(n, mu, variance, s, y, q):
-    """log p without log phi from rough s, y and q, and s, y and q to 1e-11.
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+def improved(n, mu, variance, s, y):
+    """log p without log phi from rough s and y, and s, y and v = y + r^2 to 1e-11.
 
     log p is stationary in s, so that the change of s counts by its square.
     """
     total, tilt = y + variance, variance * s
-    q = q * (2.0 - total * q)
-    q = q * (2.0 - total * q)
+    q = 1.0 / total
     less = y + tilt - n
     change, rho = less * q, y * q
     third = change * rho * (1.0 / 6.0 + change * (0.125 * rho - 1.0 / 24.0))
     term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + third)
     change *= 1.0 + change * rho * (0.5 + change * (0.5 * rho - 1.0 / 6.0))
     less -= variance * change  # y + r^2 s = n
-    wrong = 1.0 - (total - less) * q
-    return term, s - change, y - less, q + q * (wrong * (1.0 + wrong * (1.0 + wrong)))
+    return term, s - change, y - less, total - less
 
 
-@inner(fastmath=FAST, forceinline=True)
-def correction(q, rho):
+@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+def correction(v, variance):
     """log phi + 1/2 log(2 pi v)."""
+    q = 1.0 / v
+    rho = 1.0 - variance * q
     one, two, three = CORRECTION
     total = three[8]
     for j in range(7, -1, -1):
@@ -257,19 +287,18 @@ def correction(q, rho):
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilt(n, mu, variance):
-    """log p without log phi, and s, y and 1 / (y + r^2) to 1e-11."""
+    """log p without log phi, and s, y and v to 1e-11."""
     inverse = 1.0 / variance
     x = rough_x(n, mu, inverse)
-    omega, known = rough_omega(x, rougher_omega(x))
-    s = n * inverse - omega
-    return improved(n, mu, variance, s, tilted_mean(mu, s), known * inverse)
+    s = n * inverse - rough_omega(x, rougher_omega(x))
+    return improved(n, mu, variance, s, tilted_mean(mu, s))
 
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
 def _tilted_density(n, mu, variance):
     """log p of the saddlepoint expansion, less -1/2 log(2 pi)."""
-    term, _, _, q = _tilt(n, max(mu, TINY), variance)
-    return term + 0.5 * log(q) + correction(q, 1.0 - variance * q)
+    term, _, _, v = _tilt(n, max(mu, TINY), variance)
+    return term - 0.5 * log(v) + correction(v, variance)
 
 
 @inner(fastmath=FAST, forceinline=True, error_model="numpy")
@@ -280,8 +309,8 @@ def _tilted_derivatives(n, mu, variance):
     and M = q d/dq, L y = y tau and L = -rho tau M for functions of q.
     """
     mu = max(mu, TINY)
-    _, s, y, q = _tilt(n, mu, variance)
-    y = mu * _exp(s - (y + variance * s - n) * q)  # to rounding
+    _, s, y, v = _tilt(n, mu, variance)
+    y = mu * _exp(s - (y + variance * s - n) / v)  # to rounding
     q = 1.0 / (y + variance)
     tau, rho = variance * q, y * q
     m1, m2, m3 = 0.5 + _correct(1, q, tau), _correct(2, q, tau), _correct(3, q, tau)

@@ -25,6 +25,7 @@ from bayesfred.model.kernels.poisson_gaussian import (
     density_of,
     derivatives_of,
     kind_of,
+    steps,
 )
 from bayesfred.model.kernels.read_noise_sums import sum_up
 
@@ -56,6 +57,7 @@ class ReadNoiseTerms(NamedTuple):
 
     kind: tuple[int, ...]  # see `kind_of`
     variance: float | Floats  # of the read noise, counts^2: one number, or for padded rows
+    steps: tuple[Floats, Floats] | None  # see `steps`, of a frame whose pixels need the sum
     row: float | Floats  # in the table of information
     first: Floats  # these three are `InformationRows`
     step: Floats
@@ -69,9 +71,9 @@ class ReadNoiseTerms(NamedTuple):
         return density_of(noise.kind, n, mu, at(noise.variance, p)) if mu >= 0.0 else MASKED
 
     @staticmethod
-    def summed(noise: Any, values: Any, light: Any, image: Any, level: Any, place: Any) -> Any:
+    def summed(noise: Any, values: Any, light: Any, mean: Any, place: Any) -> Any:
         """Sum of log_density over segments."""
-        return sum_up(noise, values, image, level, place)
+        return sum_up(noise, values, mean, place)
 
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
@@ -252,6 +254,19 @@ def most_likely(noise, n, out):
         out[i] = mu if n[i] > 0.5 else 0.0
 
 
+@entry(fastmath=FAST, error_model="numpy")
+def _find_steps(n, variance, up, down):
+    for i in range(n.size):
+        up[i], down[i] = steps(n[i], 1.0 / variance[i])
+
+
+def frame_steps(values: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """The steps of the sum for the pixels of padded rows."""
+    up, down = np.empty(values.size), np.empty(values.size)
+    _find_steps(values.ravel(), variance, up, down)
+    return up, down
+
+
 def _typical_level(counts: Floats, variance: float) -> float:
     """About the level of the sky: the mean of the counts within 3 sd of it."""
     level = float(np.median(counts)) if counts.size else 1.0
@@ -288,4 +303,4 @@ def new_terms(
     variance: float | Floats, rows: InformationRows, row: float | Floats
 ) -> ReadNoiseTerms:
     """The compiled half for pixels in the order in which they are given, without a frame."""
-    return ReadNoiseTerms(kind_of(variance), variance, row, *rows, no_series(), None)
+    return ReadNoiseTerms(kind_of(variance), variance, None, row, *rows, no_series(), None)

@@ -7,22 +7,28 @@ cache in between. A table is read one number at a time, because instructions tha
 slower. The logarithm of four pixels' factors is that of their product.
 """
 
+import math
 from typing import Any
 
 from numba import types
 from numba.extending import overload
 
-from bayesfred.imaging.kernels.compilation import leaf
+from bayesfred.imaging.kernels.compilation import inner, leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log, split
 from bayesfred.model.kernels.contexts import LIMIT, MASKED, STRETCH
 from bayesfred.model.kernels.cumulants import table_cell, table_value
+from bayesfred.model.kernels.noise_dispatch import part_of, scaled
 from bayesfred.model.kernels.poisson_gaussian import (
+    LEAST,
+    REACH,
     TINY,
-    at,
+    WIDE,
     correction,
     density_of,
     improved,
+    nearest,
+    photon_sum,
     rough_omega,
     rough_x,
     rougher_omega,
@@ -31,11 +37,11 @@ from bayesfred.model.kernels.poisson_gaussian import (
 
 
 @leaf(fastmath=REDUCE, error_model="numpy")
-def _find_cells(table, values, image, level, cells, places):
+def _find_cells(table, values, mean, cells, places):
     """The cells of a stretch's pixels in the table of g, and the sum of -mu."""
-    total = 0.0
+    (image, level, response), total = mean, 0.0
     for i in range(image.size):
-        n, mu = values[i], image[i] + level
+        n, mu = values[i], scaled(image[i] + level, response, i)
         cell, places[i] = table_cell(table, n, log(max(mu, TINY)))
         cells[i] = as_float(cell)
         less = -mu if mu >= 0.0 else MASKED
@@ -61,12 +67,12 @@ def _sum_cells(table, cells, places):
 
 
 @leaf()
-def _sum_tabulated(table, values, image, level, scratch):
+def _sum_tabulated(table, values, mean, scratch):
     cells, places, total = scratch[0], scratch[1], 0.0
-    for a in range(0, image.size, STRETCH):
-        n, light = values[a : a + STRETCH], image[a : a + STRETCH]
+    for a in range(0, values.size, STRETCH):
+        n = values[a : a + STRETCH]
         cell, place = cells[: n.size], places[: n.size]
-        total += _find_cells(table, n, light, level, cell, place)
+        total += _find_cells(table, n, part_of(mean, a, n.size), cell, place)
         total += _sum_cells(table, cell, place)
     return total
 
@@ -80,45 +86,49 @@ def _sum(x):
 
 
 @leaf(fastmath=REDUCE, error_model="numpy")
-def _sum_densities(kind, variance, values, image, level):
+def _sum_densities(kind, variance, values, mean):
     """The sum from the formulas, one pixel after another."""
-    total = 0.0
+    (image, level, response), total = mean, 0.0
     for i in range(image.size):
-        mu = image[i] + level
+        mu = scaled(image[i] + level, response, i)
         counted = values[i] > LIMIT
         n = values[i] if counted else mu
-        term = density_of(kind, n, mu, at(variance, i)) if mu >= 0.0 else MASKED
+        term = density_of(kind, n, mu, variance) if mu >= 0.0 else MASKED
         total += term if counted else 0.0
     return total
 
 
 @leaf()
-def _sum_segments(table, noise, values, image, level, place):
+def _sum_segments(table, noise, values, mean, place):
     """The sum from the table, or from the formulas where it does not serve."""
     (kind, variance), (first, scratch), total, k = noise, place, 0.0, 0
-    last = image.size // SEGMENT
+    last = values.size // SEGMENT
     left_out = table.left_out[first // SEGMENT :][:last]
     whole = _sum(left_out)
     if whole > LIMIT:  # the table serves all of them
-        return whole + _sum_tabulated(table, values, image, level, scratch)
+        return whole + _sum_tabulated(table, values, mean, scratch)
     while k < last:
         begin, served = k, left_out[k] > LIMIT
         while k < last and (left_out[k] > LIMIT) == served:
             total += left_out[k] if served else 0.0
             k += 1
-        a, b = begin * SEGMENT, k * SEGMENT
+        n = values[begin * SEGMENT : k * SEGMENT]
+        part = part_of(mean, begin * SEGMENT, n.size)
         if served:
-            total += _sum_tabulated(table, values[a:b], image[a:b], level, scratch)
+            total += _sum_tabulated(table, n, part, scratch)
         else:
-            total += _sum_densities(kind, variance, values[a:b], image[a:b], level)
+            total += _sum_densities(kind, variance, n, part)
     return total
 
 
 @leaf(fastmath=FAST, error_model="numpy")
-def _find_x(variance, values, image, level, x, q):
+def _find_x(variance, values, mean, x, inverse, mu):
+    """x, 1 / r^2 and the mean."""
+    image, level, response = mean
     for i in range(image.size):
-        q[i] = 1.0 / variance[i]
-        x[i] = rough_x(values[i], max(image[i] + level, TINY), q[i])
+        mu[i] = scaled(image[i] + level, response, i)
+        inverse[i] = 1.0 / variance[i]
+        x[i] = rough_x(values[i], max(mu[i], TINY), inverse[i])
 
 
 @leaf(fastmath=FAST)
@@ -128,38 +138,36 @@ def _guess_omega(x, w):
 
 
 @leaf(fastmath=FAST, error_model="numpy")
-def _find_tilt(values, x, w, q):
-    """The tilts s in place of x, and 1 / (y + r^2) roughly in place of 1 / r^2."""
+def _find_tilt(values, x, w, inverse):
+    """The tilts s in place of x."""
     for i in range(x.size):
-        omega, known = rough_omega(x[i], w[i])
-        x[i] = values[i] * q[i] - omega
-        q[i] *= known
+        x[i] = values[i] * inverse[i] - rough_omega(x[i], w[i])
 
 
-@leaf(fastmath=FAST, error_model="numpy")
-def _find_means(image, level, s, y):
+@leaf(fastmath=FAST)
+def _find_means(mu, s, y):
     for i in range(s.size):
-        y[i] = tilted_mean(max(image[i] + level, TINY), s[i])
+        y[i] = tilted_mean(max(mu[i], TINY), s[i])
 
 
 @leaf(fastmath=REDUCE, error_model="numpy")
-def _sum_tilted(variance, values, image, level, rough):
-    """The sum of log p without log phi, and 1 / (y + r^2) in place of its rough value."""
-    (s, y, q), total = rough, 0.0
-    for i in range(image.size):
-        n, mu = values[i], image[i] + level
-        term, _, _, known = improved(n, mu, variance[i], s[i], y[i], q[i])
-        q[i] = known if n > LIMIT else 1.0
-        term = term if mu >= 0.0 else MASKED
-        total += term if n > LIMIT else 0.0
+def _sum_tilted(variance, values, mu, tilts, v):
+    """The sum of log p without log phi, and v = y + r^2."""
+    (s, y), total = tilts, 0.0
+    for i in range(mu.size):
+        term, _, _, spread = improved(values[i], mu[i], variance[i], s[i], y[i])
+        counted = values[i] > LIMIT
+        v[i] = spread if counted else 1.0
+        term = term if mu[i] >= 0.0 else MASKED
+        total += term if counted else 0.0
     return total
 
 
 @leaf(fastmath=REDUCE, error_model="numpy")
-def _sum_corrections(variance, values, q):
+def _sum_corrections(variance, values, v):
     total = 0.0
-    for i in range(q.size):
-        term = correction(q[i], 1.0 - variance[i] * q[i])
+    for i in range(v.size):
+        term = correction(v[i], variance[i])
         total += term if values[i] > LIMIT else 0.0
     return total
 
@@ -174,42 +182,117 @@ def _sum_logs(q):
 
 
 @leaf()
-def _sum_expansion(variance, values, image, level, scratch):
+def _sum_expansion(variance, values, mean, scratch):
     """The sum of the saddlepoint expansion over pixels that differ in their read noise."""
     total = 0.0
-    for a in range(0, image.size, STRETCH):
-        n, light, r = values[a : a + STRETCH], image[a : a + STRETCH], variance[a : a + STRETCH]
-        s, y, q = scratch[0, : n.size], scratch[1, : n.size], scratch[2, : n.size]
-        _find_x(r, n, light, level, s, q)
+    for a in range(0, values.size, STRETCH):
+        n, r = values[a : a + STRETCH], variance[a : a + STRETCH]
+        s, y, v, mu = (
+            scratch[0, : n.size],
+            scratch[1, : n.size],
+            scratch[2, : n.size],
+            scratch[3, : n.size],
+        )
+        _find_x(r, n, part_of(mean, a, n.size), s, v, mu)
         _guess_omega(s, y)
-        _find_tilt(n, s, y, q)
-        _find_means(light, level, s, y)
-        total += _sum_tilted(r, n, light, level, (s, y, q))
-        total += _sum_corrections(r, n, q) + 0.5 * _sum_logs(q)
+        _find_tilt(n, s, y, v)
+        _find_means(mu, s, y)
+        total += _sum_tilted(r, n, mu, (s, y), v)
+        total += _sum_corrections(r, n, v) - 0.5 * _sum_logs(v)
     return total
 
 
-def sum_up(noise: Any, values: Any, image: Any, level: Any, place: Any) -> Any:
+@leaf(fastmath=FAST, error_model="numpy")
+def _find_sums(steps, values, mean, sums, mu):
+    """The photon sums, and the mean."""
+    (up, down), (image, level, response) = steps, mean
+    for i in range(image.size):
+        mu[i] = scaled(image[i] + level, response, i)
+        sums[i] = photon_sum(nearest(values[i]), max(mu[i], LEAST), up[i], down[i])
+
+
+@leaf(fastmath=REDUCE, error_model="numpy")
+def _sum_powers(values, mu, sums):
+    """The sum of log p without the mantissas of the photon sums, and these in their place."""
+    total = 0.0
+    for i in range(mu.size):
+        exponent, mantissa = split(sums[i])
+        term = (nearest(values[i]) - REACH) * log(max(mu[i], LEAST)) - mu[i]
+        term += exponent * math.log(2.0)
+        counted = values[i] > LIMIT
+        sums[i] = mantissa if counted else 1.0
+        term = term if mu[i] >= 0.0 else MASKED
+        total += term if counted else 0.0
+    return total
+
+
+@leaf()
+def _sum_photons(steps, values, mean, scratch):
+    """The sum of log p over pixels that differ in their read noise, from the steps of each."""
+    (up, down), total = steps, 0.0
+    for a in range(0, values.size, STRETCH):
+        n, here = values[a : a + STRETCH], (up[a : a + STRETCH], down[a : a + STRETCH])
+        sums, mu = scratch[0, : n.size], scratch[3, : n.size]
+        _find_sums(here, n, part_of(mean, a, n.size), sums, mu)
+        total += _sum_powers(n, mu, sums) + _sum_logs(sums)
+    return total
+
+
+@leaf(fastmath=FAST)
+def _select(variance, values, wide, out):
+    """The counts of pixels that have wide read noise, or not, the others MASKED; how many count."""
+    count = 0
+    for i in range(out.size):
+        chosen = (values[i] > LIMIT) & ((variance[i] >= WIDE) == wide)
+        out[i] = values[i] if chosen else MASKED
+        count += chosen
+    return count
+
+
+@leaf()
+def _sum_mixed(variance, steps, values, mean, scratch):
+    """The sum over pixels some of which need one formula, some the other."""
+    (up, down), total = steps, 0.0
+    for a in range(0, values.size, STRETCH):
+        n, r = scratch[4, : values[a : a + STRETCH].size], variance[a : a + STRETCH]
+        b, part = a + n.size, part_of(mean, a, n.size)
+        if _select(r, values[a:b], True, n) > 0:
+            total += _sum_expansion(r, n, part, scratch)
+        if _select(r, values[a:b], False, n) > 0:
+            total += _sum_photons((up[a:b], down[a:b]), n, part, scratch)
+    return total
+
+
+@inner(inline="always")
+def _steps_of(noise, first, size):
+    return noise.steps[0][first : first + size], noise.steps[1][first : first + size]
+
+
+def sum_up(noise: Any, values: Any, mean: Any, place: Any) -> Any:
     """Sum of log p over segments, from the table of one read noise where there is one."""
     raise NotImplementedError("for compiled code")
 
 
 @overload(sum_up, inline="always", strict=False)
-def _choose_sum(noise: Any, values: Any, image: Any, level: Any, place: Any) -> Any:
+def _choose_sum(noise: Any, values: Any, mean: Any, place: Any) -> Any:
     """Of the noise only what is used: to pass all of it on costs half as much as a row's pixels."""
     kinds = dict(zip(noise.fields, noise.types, strict=True))
     if not isinstance(kinds["variance"], types.Array):
-        return lambda noise, values, image, level, place: _sum_segments(
-            noise.cumulants, (noise.kind, noise.variance), values, image, level, place
+        return lambda noise, values, mean, place: _sum_segments(
+            noise.cumulants, (noise.kind, noise.variance), values, mean, place
+        )
+    if len(kinds["kind"]) == 0:
+        return lambda noise, values, mean, place: _sum_photons(
+            _steps_of(noise, place[0], values.size), values, mean, place[1]
         )
     if len(kinds["kind"]) == 1:
-        return lambda noise, values, image, level, place: _sum_expansion(
-            noise.variance[place[0] : place[0] + image.size],
-            values,
-            image,
-            level,
-            place[1],
+        return lambda noise, values, mean, place: _sum_expansion(
+            noise.variance[place[0] : place[0] + values.size], values, mean, place[1]
         )
-    return lambda noise, values, image, level, place: _sum_densities(
-        noise.kind, noise.variance[place[0] : place[0] + image.size], values, image, level
+    return lambda noise, values, mean, place: _sum_mixed(
+        noise.variance[place[0] : place[0] + values.size],
+        _steps_of(noise, place[0], values.size),
+        values,
+        mean,
+        place[1],
     )

@@ -27,7 +27,7 @@ from bayesfred.model.kernels.noise_dispatch import (
     information,
     log_density,
     spread,
-    sum_scaled,
+    summed,
 )
 from bayesfred.model.kernels.read_noise import LevelSeries, level_series, no_series, sum_unreached
 from bayesfred.model.noise.poisson import PoissonNoise
@@ -50,8 +50,10 @@ class FlatFieldTerms(NamedTuple):
         return log_density(noise.base, f * n, f * mu, f * light, p)
 
     @staticmethod
-    def summed(noise: Any, values: Any, light: Any, image: Any, level: Any, place: Any) -> Any:
-        return sum_scaled(noise.base, noise.counts, (image, level, noise.response), place)
+    def summed(noise: Any, values: Any, light: Any, mean: Any, place: Any) -> Any:
+        a, b = place[0], place[0] + values.size
+        scaled = (mean[0], mean[1], noise.response[a:b])
+        return summed(noise.base, noise.counts[a:b], light, scaled, place)
 
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:

@@ -27,6 +27,7 @@ from bayesfred.model.kernels.read_noise import (
     CELLS,
     InformationRows,
     ReadNoiseTerms,
+    frame_steps,
     informations,
     level_series,
     log_densities,
@@ -171,11 +172,12 @@ def _moments(means: Floats, r: float) -> Floats:
 def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     """The compiled half for a frame of padded rows."""
     terms = _terms(read_noise)
-    cumulants = None
-    if isinstance(read_noise, float):
-        cumulants = cumulant_table(read_noise**2, values, SEGMENT)
     level = level_series(terms, values, float(np.median(np.square(read_noise))))
-    return terms._replace(level=level, cumulants=cumulants)
+    if isinstance(read_noise, float):
+        terms = terms._replace(cumulants=cumulant_table(read_noise**2, values, SEGMENT))
+    elif len(terms.kind) != 1:
+        terms = terms._replace(steps=frame_steps(values, read_noise**2))
+    return terms._replace(level=level)
 
 
 def _terms(read_noise: float | Floats) -> ReadNoiseTerms:
