@@ -260,7 +260,8 @@ def _log_density(frame, parameters, cluster, h):
         image = patch.image[a:b]
         part = stretch(frame, parameters.background, patch.top + j, first, image)
         slope_run(part, patch.score[a:b])
-        value += sum_pixels(noise, part.values, image, patch.score[a:b], part.c0, first)
+        mean = (patch.score[a:b], part.c0, None)
+        value += sum_pixels(noise, part.values, image, mean, first)
     return value + _log_prior(cluster, h)
 
 
