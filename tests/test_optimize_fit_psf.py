@@ -5,16 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import bayesfred as bf
 from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
 from bayesfred.model.kernels.psf_samples import SourceSamples
 from bayesfred.model.psf_errors import PsfErrors
-from bayesfred.optimize.fit_psf import find_psf, solved, starting_state
+from bayesfred.optimize import psf_start
+from bayesfred.optimize.fit_psf import find_psf, solved
 from bayesfred.optimize.psf_equations import PsfEquations, PsfInformation, observed
 from bayesfred.optimize.psf_levels import PsfGrid
 from bayesfred.optimize.psf_marginal import occam_factor, shared_information
 from bayesfred.optimize.psf_samples import PsfSamples
+from bayesfred.optimize.psf_start import starting_grid, starting_state
 
 LINEAR = bf.PolynomialDistortion.polynomial(1)
 
@@ -55,7 +58,7 @@ def crowded(rng, n_pixels=40, n_sources=3):
 @pytest.mark.parametrize(("degree", "wings"), [(1, True), (1, False), (0, True), (0, False)])
 def test_information_and_slope_agree_with_a_dense_design_matrix(degree, wings):
     rng = np.random.default_rng(1)
-    grid = PsfGrid(1.3, 0.8, degree, 5.6, 16.8 if wings else 0.0)
+    grid = PsfGrid(1.3, 0.8, degree, 5.6, 4.0, 16.8 if wings else 0.0)
     samples = crowded(rng)
     field = np.column_stack([np.ones(3), rng.normal(size=(3, 2 * degree))])
     levels, n = grid.unknown, len(samples.first) - 1
@@ -127,7 +130,7 @@ def test_samples_are_those_that_loops_over_pixels_find(distortion):
 
 def test_the_grids_together_are_one_fine_grid():
     rng = np.random.default_rng(2)
-    grid = PsfGrid(4.0, 0.7, 2, 4.9, 14.7)
+    grid = PsfGrid(4.0, 0.7, 2, 4.9, 3.5, 14.7)
     c = rng.normal(size=grid.conventions.shape[1])
     psf = grid.combined(c)
     n = psf.shape[-1]
@@ -201,6 +204,48 @@ def test_a_known_psf_is_recovered_to_its_errors(psf, fwhm):
     assert np.abs(measured.density(x, x[:, None]) - true).max() < 0.02 * true.max()
 
 
+def defocused(seed):
+    """A disc with sharp edges, a pinhole's image out of focus, on sources of all pixel phases."""
+    x = np.arange(-64, 65) / 16.0
+    disc = ndimage.gaussian_filter((np.hypot(x, x[:, None]) < 2.5).astype(float), 0.3 * 16.0)
+    model = bf.ForwardModel(
+        bf.Detector((260, 260), pixel="box"), bf.SourceCatalog.grid(11, 21.37, 2e5),
+        bf.SampledPSF(disc, 16.0), bf.PolynomialDistortion.polynomial(1),
+    )  # fmt: skip
+    theta = np.array([1e-3, -5e-4, 4e-4, 2e-4])
+    counts = bf.simulate(model, theta, 50.0, seed=seed)
+    start = replace(model, psf=bf.GaussianPSF(1.5))
+    return theta, bf.Posterior(start, counts, nuisances=bf.Nuisances(flux="free", offset=True))
+
+
+def off_by(seed):
+    """The errors of the distortion in units of their own, and whether the model fits."""
+    theta, posterior = defocused(seed)
+    _, estimate = bf.measure_psf(posterior, bf.find_map(posterior))
+    z = (estimate.params - np.append(theta, np.zeros(len(estimate.params) - 4)))[:4]
+    return z / np.sqrt(np.diag(estimate.covariance))[:4], estimate.fits_data
+
+
+@pytest.mark.slow
+def test_sharp_edges_are_resolved(monkeypatch):
+    _, fits = off_by(0)
+    assert fits
+    # with the knots of a smooth PSF of that width the frame does not fit
+    monkeypatch.setattr(psf_start, "SHARP", 1.0)
+    assert not off_by(0)[1]
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize("sharp", [None, 1.0], ids=["as it is", "knots of a smooth PSF"])
+def test_errors_hold_for_a_defocused_psf(sharp, monkeypatch):
+    if sharp:
+        monkeypatch.setattr(psf_start, "SHARP", sharp)
+    z = np.array([off_by(seed)[0] for seed in range(24)])
+    # 96 numbers: the mean square scatters by sqrt(2 / 96) = 0.14
+    holds = abs(np.mean(z**2) - 1.0) < 3.0 * np.sqrt(2.0 / z.size)
+    assert holds == (sharp is None), np.mean(z**2)
+
+
 def comatic():
     """A Gaussian with the pixel in it, and coma that grows outward but moves no centroid."""
     x = np.arange(-24, 25) / 4.0
@@ -227,13 +272,17 @@ def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
         assert off[0] < 0.03 and off[1] > 2.0 * off[0], off
 
 
+def began(posterior, estimate, degree):
+    return starting_state(posterior, estimate, starting_grid(posterior, estimate, 4.0, degree))
+
+
 @pytest.mark.long
 def test_errors_of_the_psf_are_those_of_a_joint_fit():
     """The former come from draws of the PSF, the joint fit from one matrix."""
     _, _, posterior = frame_of(bf.MoffatPSF(1.2, 4.765), 1.2, side=4)
     estimate = bf.find_map(posterior)
     measured, known = bf.measure_psf(posterior, estimate)
-    equations = solved(posterior, starting_state(posterior, estimate, 4.0, 0))
+    equations = solved(posterior, began(posterior, estimate, 0))
     size = equations.state.deviations.size
     kept = [size + k for k, name in enumerate(posterior.parameter_names)
             if name in measured.parameter_names and name != "background"]  # fmt: skip
@@ -498,7 +547,7 @@ def test_strengths_to_begin_with_do_not_matter():
         replace(model, psf=bf.GaussianPSF(0.55)), bf.simulate(model, theta, 5.0, seed=3),
         nuisances=bf.Nuisances(flux="free", offset=True),
     )  # fmt: skip
-    start = starting_state(posterior, bf.find_map(posterior), 4.0, 1)
+    start = began(posterior, bf.find_map(posterior), 1)
     found = [
         solved(posterior, replace(start, strengths=np.full(len(start.strengths), strength)))
         for strength in (1.0, 1e5)

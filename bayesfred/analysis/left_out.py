@@ -26,13 +26,13 @@ from scipy import linalg, special
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.folds import Folds
 from bayesfred.analysis.sources import source_table
-from bayesfred.imaging.psf import FWHM, GaussianPSF, MeasuredPSF
+from bayesfred.imaging.psf import GaussianPSF, MeasuredPSF
 from bayesfred.io.summary_table import Table, vstack
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.fit_psf import FULLY_SAMPLED
 from bayesfred.optimize.measure_psf import measure_psf
 from bayesfred.optimize.newton import maximize
+from bayesfred.optimize.psf_start import oversampling_of
 
 __all__ = ["LeftOut", "Weights", "leave_out", "measured_here"]
 
@@ -155,7 +155,7 @@ def _fitted(rest: Posterior, estimate: MapEstimate) -> tuple[Posterior, MapEstim
     if not isinstance(psf, MeasuredPSF):
         top = maximize(rest, estimate.params)
         return rest, MapEstimate(top.params, top.covariance, top.log_prob, top.evaluations, "")
-    finest = math.ceil(psf.oversampling * max(1.0, FWHM * psf.sigma / FULLY_SAMPLED))
+    finest = oversampling_of(psf)
     optical = math.sqrt(max(psf.sigma**2 - PIXEL_VARIANCE, NARROWEST**2))
     model = replace(
         rest.model, psf=GaussianPSF(optical), detector=replace(rest.model.detector, pixel="box")

@@ -17,14 +17,11 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-from numpy.polynomial.legendre import leggauss
-from scipy import spatial
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.psf import FWHM, PSF, MeasuredPSF, density_at, has_pixel
+from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.imaging.psf.measured import check_choices, field_terms
-from bayesfred.imaging.psf.sampled import spline_coefficients
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.anderson import accelerated
@@ -32,15 +29,14 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.psf_equations import (
     SECANTS,
     STILL,
-    WIDTH,
     PsfEquations,
     PsfState,
     field_radius,
 )
-from bayesfred.optimize.psf_levels import STRENGTH, PsfGrid
+from bayesfred.optimize.psf_levels import STRENGTH
 from bayesfred.optimize.psf_samples import PsfSamples
+from bayesfred.optimize.psf_start import reach, starting_grid, starting_state, suited_grid
 
-FULLY_SAMPLED = 1.5  # pixel: PSFs of a larger FWHM have fewer knots per pixel
 TURNS = 40
 CHOOSING = 8  # turns of the strengths of the prior within one
 EXACT = 4  # turns in which the model is taken to be exact, at the most
@@ -49,9 +45,6 @@ FARTHER = 10.0  # than the nearest place: there it leads no more at all
 LARGEST = 0.4  # change of the PSF in one turn, share of its peak
 DARKEST = 0.1  # of its value that a flux may fall to in one turn
 DRAWS = 100
-DARK = 0.1  # of the pixels are beyond the PSF of every source, where that can be
-RADIUS = 7.0  # of the fine grid, widths of the PSF
-NARROWEST = 4.0  # the same, where stars leave no pixels between them
 WINGS = 21.0  # of the grid for wings
 WINGS_SEEN = 5.0  # standard deviations of light beyond the fine grid that call for a wider one
 
@@ -130,12 +123,29 @@ def find_psf(
             "PSF has one pixel in it; describe the frame in recorded pixels"
         )
     with one_blas_thread():
-        state = starting_state(posterior, estimate, float(oversampling), degree)
-        equations = solved(posterior, state)
+        equations = solved(posterior, _start(posterior, estimate, float(oversampling), degree))
         wider = _with_wings(posterior, equations.state)
         if _light_beyond(posterior, wider) > WINGS_SEEN:
             equations = solved(posterior, wider)
         return _measured(posterior, equations)
+
+
+def _start(
+    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int
+) -> PsfState:
+    """Where the search begins: a PSF that does not vary tells which grids it needs."""
+    grid = starting_grid(posterior, estimate, oversampling, degree)
+    if grid.oversampling == oversampling:
+        return starting_state(posterior, estimate, grid)
+    constant = starting_state(posterior, estimate, replace(grid, degree=0))
+    known = solved(posterior, constant).state
+    suited = suited_grid(grid, known, oversampling)
+    if suited is grid and degree == 0:
+        return known
+    return replace(
+        starting_state(posterior, estimate, suited),
+        params=known.params, fluxes=known.fluxes, shifts=known.shifts,
+    )  # fmt: skip
 
 
 def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
@@ -174,50 +184,6 @@ def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
         f"psf: no PSF found in {TURNS} turns: expected a start that resembles it: fit the width "
         "first (nuisances: psf_sigma), or begin from another PSF"
     )
-
-
-def starting_state(
-    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int
-) -> PsfState:
-    """The posterior's own PSF on the grids, with its pixel.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    estimate : MapEstimate
-    oversampling : float
-    degree : int
-
-    Returns
-    -------
-    PsfState
-    """
-    psf, names = posterior.model.psf, posterior.parameter_names
-    sigma = float(estimate.params[names.index(WIDTH)]) if WIDTH in names else psf.sigma
-    pixel = 0.0 if has_pixel(psf) or posterior.model.detector.pixel == "impulse" else 1.0
-    width = math.hypot(sigma, pixel / math.sqrt(12.0))
-    knots = max(1.0, min(oversampling, oversampling * FULLY_SAMPLED / (FWHM * width)))
-    radius = min(RADIUS * width, max(NARROWEST * width, _reach(posterior, estimate.params)))
-    grid = PsfGrid(knots, width, degree, radius)
-    side = int(grid.levels.side[0])
-    x = np.linspace(-0.5, 0.5, side) * ((side - 1) / knots)
-    c = spline_coefficients(_pixel_density(psf, psf.sigma / sigma, pixel, x))
-    coefficients = np.zeros(grid.conventions.shape[1])
-    coefficients[: c.size] = c.ravel() * (knots**2 / c.sum())
-    _, _, fluxes, shifts = posterior.likelihood.own_pixels(estimate.params, grid.radius)
-    strengths = np.full(len(grid.blocks), STRENGTH)
-    return PsfState(grid, coefficients, strengths, estimate.params, fluxes, shifts)
-
-
-def _pixel_density(psf: PSF, scale: float, pixel: float, x: Floats) -> Floats:
-    """The PSF narrowed by a factor, integrated over a pixel around the points of a grid."""
-    nodes, weights = leggauss(8) if pixel else (np.zeros(1), np.full(1, 2.0))
-    out = np.zeros((x.size, x.size))
-    for s, w_s in zip(0.5 * pixel * nodes, 0.5 * weights, strict=True):
-        for t, w_t in zip(0.5 * pixel * nodes, 0.5 * weights, strict=True):
-            a, b = scale * (x + s), scale * (x[:, None] + t)
-            out += w_s * w_t * density_at(psf, a, b, (0.0, 0.0)) * scale**2
-    return out
 
 
 def _far(equations: PsfEquations) -> float:
@@ -280,19 +246,6 @@ def _moved(posterior: Posterior, state: PsfState, change: Floats) -> PsfState:
     return replace(state, coefficients=coefficients, params=params, fluxes=fluxes, shifts=shifts)
 
 
-def _reach(posterior: Posterior, params: Floats) -> float:
-    """How far from their sources the PSF may reach and leave pixels that tell the background.
-
-    Where all pixels have light of some source, a pedestal under every star is no different from the
-    background.
-    """
-    images = posterior.likelihood.image_positions(params)
-    ny, nx = posterior.mask.shape
-    pixels = np.argwhere(posterior.mask)[:, ::-1] - 0.5 * np.array([nx - 1, ny - 1])
-    distance, _ = spatial.cKDTree(images[np.isfinite(images).all(axis=1)]).query(pixels)
-    return float(np.quantile(distance, 1.0 - DARK))
-
-
 def _light_beyond(posterior: Posterior, state: PsfState) -> float:
     """By how many standard deviations light that falls as r^-4 lies between fine grid and wings."""
     radius, wings = state.grid.fine_radius, state.grid.wings
@@ -310,7 +263,7 @@ def _light_beyond(posterior: Posterior, state: PsfState) -> float:
 
 def _with_wings(posterior: Posterior, state: PsfState) -> PsfState:
     """The state with a grid for wings, which are none yet."""
-    wings = min(WINGS * state.grid.sigma, _reach(posterior, state.params))
+    wings = min(WINGS * state.grid.sigma, reach(posterior, state.params))
     grid = replace(state.grid, wings=max(wings, state.grid.fine_radius))
     more = grid.conventions.shape[1] - state.coefficients.size
     return replace(

@@ -27,7 +27,6 @@ from bayesfred._typing import Floats
 from bayesfred.imaging.psf.measured import field_powers
 from bayesfred.model.kernels.psf_normal import Levels, halved
 
-FIELD_RADIUS = 5.0  # of the grid for the variation over the field, widths of the PSF
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
 STRENGTH = 100.0  # to begin with
 LIMITS = (1e-3, 1e6)  # of a strength: the evidence would take a good start for exact
@@ -55,6 +54,8 @@ class PsfGrid:
         Of the variation over the field.
     fine_radius : float, pixel
         Of the fine grid.
+    varying_radius : float, pixel
+        Of the grid for the variation over the field.
     wings : float, pixel
         Radius of the grid for wings; 0 where there is none.
     """
@@ -63,6 +64,7 @@ class PsfGrid:
     sigma: float
     degree: int
     fine_radius: float
+    varying_radius: float
     wings: float = 0.0
 
     @property
@@ -76,7 +78,7 @@ class PsfGrid:
         terms = len(field_powers(self.degree))
         rows = [(1, self.fine_radius, 0, 1), (1, self.fine_radius, 0, 1)]
         if terms > 1:
-            rows.append((2, min(FIELD_RADIUS * self.sigma, self.fine_radius), 1, terms))
+            rows.append((2, self.varying_radius, 1, terms))
         if self.wings:
             rows.append((8, self.wings, 0, 1))
         h = np.array([times / self.oversampling for times, *_ in rows])

@@ -166,12 +166,12 @@ class MeasuredPSF:
     @cached_property
     def peak(self) -> float:
         """Largest value at a knot, at the field's middle, per square pixel."""
-        return float(_at_knots(self.coefficients[0]).max())
+        return float(values_at_knots(self.coefficients[0]).max())
 
     @cached_property
     def sigma(self) -> float:
         """Width of the Gaussian that exceeds half the peak in as large an area, pixel."""
-        bright = np.argwhere(_at_knots(self.coefficients[0]) >= 0.3 * self.peak)
+        bright = np.argwhere(values_at_knots(self.coefficients[0]) >= 0.3 * self.peak)
         side = self.coefficients.shape[-1]
         low = bright.min(axis=0) - 1.5 - 0.5 * (side - 1)
         high = bright.max(axis=0) + 1.5 - 0.5 * (side - 1)
@@ -254,7 +254,7 @@ class MeasuredPSF:
             If the file exists or cannot be written.
         """
         arrays = {"coefficients": self.coefficients, "draws": self.draws}
-        image = _at_knots(self.coefficients[0])
+        image = values_at_knots(self.coefficients[0])
         numbers = {
             "oversampling": self.oversampling, "field_radius": self.field_radius,
             "determined": self.determined, "model_error": self.model_error,
@@ -322,8 +322,23 @@ class MeasuredPSF:
             yield replace(self, coefficients=coefficients, draws=None)
 
 
-def _at_knots(c: Floats) -> Floats:
-    """The spline's values at its knots."""
+def values_at_knots(c: Floats) -> Floats:
+    """The values of a spline at its knots.
+
+    Parameters
+    ----------
+    c : ndarray, shape (n, n)
+        Its coefficients.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+
+    Examples
+    --------
+    >>> float(values_at_knots(np.ones((3, 3)))[1, 1].round(9))
+    1.0
+    """
     kernel = np.array([1.0, 4.0, 1.0]) / 6.0
     once = ndimage.convolve1d(c, kernel, axis=0, mode="constant")
     return np.asarray(ndimage.convolve1d(once, kernel, axis=1, mode="constant"))
