@@ -62,7 +62,8 @@ def fit_psf(
     estimate : MapEstimate
         Its maximum.
     oversampling : int
-        Knots per pixel, of PSFs with a FWHM up to 1.5 pixels; wider ones have as many per FWHM.
+        Knots per pixel, of PSFs with a FWHM up to 1.5 pixels; wider ones have as many per FWHM, and
+        2.5 times as many if their edges are sharp, as out of focus.
     degree : int
         Of the polynomial by which the PSF varies over the field; 0 if it does not. The variation
         has half as many knots per pixel, three per FWHM.
