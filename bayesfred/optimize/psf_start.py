@@ -13,8 +13,7 @@ from scipy import spatial
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.psf import FWHM, PSF, MeasuredPSF, density_at, has_pixel
-from bayesfred.imaging.psf.measured import values_at_knots
-from bayesfred.imaging.psf.sampled import spline_coefficients
+from bayesfred.imaging.psf.spline_values import spline_coefficients, values_at_knots
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.psf_equations import WIDTH, PsfState

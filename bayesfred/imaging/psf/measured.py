@@ -18,6 +18,7 @@ from bayesfred.imaging.psf.sampled import (
     MOST_SAMPLES,
     spline_profile,
 )
+from bayesfred.imaging.psf.spline_values import values_at_knots
 from bayesfred.io import psf_images
 from bayesfred.io.serialize import serializable
 
@@ -320,28 +321,6 @@ class MeasuredPSF:
         """The PSFs that were drawn from its posterior, each without errors of its own."""
         for coefficients in self.draws if self.draws is not None else ():
             yield replace(self, coefficients=coefficients, draws=None)
-
-
-def values_at_knots(c: Floats) -> Floats:
-    """The values of a spline at its knots.
-
-    Parameters
-    ----------
-    c : ndarray, shape (n, n)
-        Its coefficients.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-
-    Examples
-    --------
-    >>> float(values_at_knots(np.ones((3, 3)))[1, 1].round(9))
-    1.0
-    """
-    kernel = np.array([1.0, 4.0, 1.0]) / 6.0
-    once = ndimage.convolve1d(c, kernel, axis=0, mode="constant")
-    return np.asarray(ndimage.convolve1d(once, kernel, axis=1, mode="constant"))
 
 
 @serializable("psf.measured")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, ndimage, special
+from scipy import ndimage, special
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
@@ -23,6 +23,7 @@ from bayesfred.imaging.kernels.splines import (
     spline_second_derivatives,
     spline_slopes,
 )
+from bayesfred.imaging.psf.spline_values import spline_coefficients
 from bayesfred.io.serialize import serializable
 
 MOST_SAMPLES = 1001  # a side
@@ -378,20 +379,3 @@ class SampledPSF:
         at = np.stack(np.broadcast_arrays(b, a)) * self.oversampling + 0.5 * (len(self._spline) - 1)
         values = ndimage.map_coordinates(self._spline, at.reshape(2, -1), prefilter=False)
         return np.asarray(self.oversampling**2 * values.reshape(at.shape[1:]))
-
-
-def spline_coefficients(values: Floats) -> Floats:
-    """Coefficients of the cubic spline through the values.
-
-    Along either axis (c[i - 1] + 4 c[i] + c[i + 1]) / 6 = value, with zeros outside.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n, n)
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-    """
-    bands = np.array([np.full(len(values), 1.0 / 6.0), np.full(len(values), 4.0 / 6.0)])
-    return np.asarray(linalg.solveh_banded(bands, linalg.solveh_banded(bands, values).T).T)
