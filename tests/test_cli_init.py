@@ -10,6 +10,7 @@ from astropy.io import fits
 from test_analysis_photon_transfer import GAIN, NOISE, PEDESTAL, ZERO, scene, stored
 from typer.testing import CliRunner
 
+import bayesfred as bf
 from bayesfred.cli import app
 from bayesfred.settings.run import read_settings
 
@@ -93,3 +94,70 @@ def test_a_frame_that_says_nothing_of_its_noise(
     Path("a\"b\\'.npy").write_bytes(Path("dark.npy").read_bytes())
     assert invoke("a\"b\\'.npy")[0] == 0
     assert read_settings(tmp_path / "a\"b\\'.toml").frame.path == "a\"b\\'.npy"
+
+
+def camera(folder: Path, fwhm: float) -> dict[str, float]:
+    """A stranger's frame and catalogue in a folder; the coefficients of the lens that made it.
+
+    Pinholes of unlike brightness, a background that is no plane, stars that the catalogue lacks,
+    hot pixels, gain, read noise and pedestal.
+    """
+    rng, size, n = np.random.default_rng(11), 320, 10
+    grid = (np.arange(n) - 0.5 * (n - 1)) * size / (n + 1)
+    x, y = (each.ravel() for each in np.meshgrid(grid, grid))
+    few = rng.uniform(-0.5 * size, 0.5 * size, (2, 20))
+    flux = np.append(10.0 ** rng.uniform(3.3, 4.8, x.size), 10.0 ** rng.uniform(2.0, 3.5, 20))
+    terms = [(a, b, 0, 0) for a in range(4) for b in range(4 - a) if a + b]
+    lens = bf.PolynomialDistortion(f_terms=terms, g_terms=terms)
+    scale = np.array([(0.5 * size) ** -(a + b) for a, b, _, _ in terms])
+    theta = 0.7 * rng.standard_normal(2 * len(terms)) * np.tile(scale, 2)
+    sources = bf.SourceCatalog(np.append(x, few[0]), np.append(y, few[1]), flux)
+    detector, psf = bf.Detector((size, size), pixel="box"), bf.MoffatPSF(fwhm, 3.0)
+    light = bf.ForwardModel(detector, sources, psf, lens).expected_counts(theta)
+    v, u = np.mgrid[:size, :size] / size - 0.5
+    counts = rng.poisson(light + 150.0 + 40.0 * u - 30.0 * v**2).astype(float)
+    hot = rng.integers(0, size, (2, 60))
+    counts[hot[0], hot[1]] += 10.0 ** rng.uniform(2.0, 4.5, 60)
+    stored = np.rint(counts / GAIN + rng.normal(0.0, NOISE / GAIN, counts.shape) + PEDESTAL)
+    fits.PrimaryHDU(stored.clip(0, 65535).astype(np.uint16)).writeto(folder / "camera.fits")
+    np.savetxt(folder / "camera.csv", np.c_[x, y], delimiter=",", header="x,y", comments="")
+    return dict(zip(lens.names, theta, strict=True))
+
+
+@pytest.mark.parametrize("fwhm", [1.4, 3.0, 6.0])
+def test_hot_pixels_are_no_stars(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fwhm: float
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    camera(tmp_path, fwhm)
+    assert invoke("camera.fits")[0] == 0
+    run = read_settings(tmp_path / "camera.toml")
+    width = np.hypot(fwhm / 2.3548, 12.0**-0.5)  # the pixel's with it
+    assert 0.8 * width < run.psf.sigma < 1.3 * width
+    assert run.nuisances.footprint > 2.0 * fwhm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fwhm", [1.4, 3.0])
+def test_what_is_proposed_fits_a_strangers_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fwhm: float
+) -> None:
+    """Fits, and is right within its errors: chi-square of 18 degrees of freedom has p = 1e-4 at 49.
+
+    The same run file with a Gaussian PSF does not fit.
+    """
+    monkeypatch.chdir(tmp_path)
+    truth = camera(tmp_path, fwhm)
+    assert invoke("camera.fits")[0] == 0
+    done = CliRunner().invoke(app, ["fit", "camera.toml", "--map-only"])
+    assert done.exit_code == 0 and "\ntrustworthy:" in done.stdout
+    chain = bf.open_chain("chains/camera.h5")
+    own = [chain.parameter_names.index(name) for name in truth]
+    draws = chain.draws()[:, own]
+    off = draws.mean(axis=0) - list(truth.values())
+    assert off @ np.linalg.solve(np.cov(draws.T), off) < 49.0
+    text = Path("camera.toml").read_text()
+    text = re.sub('kind = "measured".*', "", text).replace("model_error = true", "psf_sigma = true")
+    Path("gaussian.toml").write_text(text)
+    done = CliRunner().invoke(app, ["fit", "gaussian.toml", "--map-only"])
+    assert done.exit_code == 3 and "does not fit the counts" in done.stdout

@@ -22,6 +22,7 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
+from bayesfred.optimize.sharp_pixels import sharp_pixels
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
@@ -100,7 +101,16 @@ def read_frame(
             note(*choice.lines())
         if has_pixel(posterior.model.psf) or rough:
             with working("measuring the PSF", show=say is not None):
-                posterior, estimate = _with_measured_psf(posterior, estimate, psf, run)
+                measured = _with_measured_psf(posterior, estimate, psf, run)
+                sharp = sharp_pixels(*measured) & f.reject_outliers
+            if found := int(sharp.sum()):
+                note(
+                    f"{found} pixel{'s' * (found > 1)} within images, sharper than the PSF: masked"
+                )
+                posterior = replace(posterior, mask=posterior.mask & ~sharp, extrapolation=None)
+                with working("measuring the PSF again", show=say is not None):
+                    measured = _with_measured_psf(posterior, estimate, psf, run)
+            posterior, estimate = measured
             note(psf_message(posterior, estimate))
     return posterior, estimate, notes
 

@@ -22,6 +22,8 @@ from bayesfred.io.saturation import plateau
 from bayesfred.settings.sections import toml_text
 
 STARS = 30  # peaks by which the PSF's width is measured
+FOOTPRINT, LEAST_FOOTPRINT = 4.5, 5.0  # widths that an image reaches, and pixels
+SHARP = 0.25  # of a peak's height beside it; an image of FWHM 1 has more, also in a pixel's middle
 KNOWN = 3.0  # standard deviations of a read noise that is worth a key
 
 TEXT = """\
@@ -30,7 +32,8 @@ TEXT = """\
 
 [frame]
 path = {path}
-{frame}
+{frame}reject_outliers = true  # hot spots, and sources that have no image
+
 [catalogue]
 path = {catalogue}  # columns x, y: pixels from the frame's middle; fluxes are free
 
@@ -38,6 +41,7 @@ path = {catalogue}  # columns x, y: pixels from the frame's middle; fluxes are f
 pixel = "box"
 
 [psf]
+kind = "measured"  # on the frame's own sources
 sigma = {sigma:.2g}  # pixels, a start: by the brightest peaks
 
 [distortion]
@@ -49,8 +53,10 @@ degree = 3
 [nuisances]
 flux = "free"
 offset = true
-psf_sigma = true
-background_order = 1
+model_error = true  # what the measured PSF leaves, as a share of the light
+# position_scatter = true  # where the catalogue's positions are no better than the images'
+background_order = 2
+footprint = {footprint}  # pixels around each image: light farther out may be anything
 """
 
 
@@ -117,9 +123,11 @@ def init(
     level = plateau(used[0][np.isfinite(used[0])])
     if level is not None:
         keys += f"saturation = {level!r}  # suspected: a plateau at the maximum\n"
+    sigma = _width(used[0])
     text = TEXT.format(
         name=printable(frame.name), path=toml_text(str(frame)), frame=keys, noise=noise,
-        catalogue=toml_text(f"{stem}.csv"), sigma=_width(used[0]),
+        catalogue=toml_text(f"{stem}.csv"), sigma=sigma,
+        footprint=max(LEAST_FOOTPRINT, round(FOOTPRINT * sigma) + 2.0),
     )  # fmt: skip
     replace(path, text.encode())
     return Proposed(path, message)
@@ -156,7 +164,10 @@ def _frame_keys(found: PhotonTransfer | None, message: str, image: StoredImage) 
 
 
 def _width(image: Floats) -> float:
-    """The width of the brightest peaks, pixels: of a Gaussian, F / 2 pi s^2 is the height."""
+    """The width of the brightest peaks, pixels: of a Gaussian, F / 2 pi s^2 is the height.
+
+    Pixels beside which there is next to nothing are hot ones.
+    """
     filled = np.where(np.isfinite(image), image, np.nanmedian(image))
     filled = (
         filled
@@ -164,6 +175,8 @@ def _width(image: Floats) -> float:
         .repeat(4, 0)
         .repeat(4, 1)[: image.shape[0], : image.shape[1]]
     )
+    beside = 9.0 * ndimage.uniform_filter(filled, 3) - filled
+    filled = np.where(beside < SHARP * filled, ndimage.median_filter(filled, 3), filled)
     smooth = ndimage.gaussian_filter(filled, 1.0)
     sigma = 1.5
     for _ in range(3):
