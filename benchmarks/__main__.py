@@ -209,6 +209,9 @@ def main() -> int:
 
     pixels, side = np.random.default_rng(1), m.detector.shape
     flat, read_noises = pixels.uniform(0.5, 1.5, side), pixels.uniform(1.0, 3.0, side)
+    # as of an sCMOS camera, whose noisiest pixels are a tail
+    tail = np.where(pixels.random(side) < 0.05, pixels.uniform(2.0, 6.0, side), 0.0)
+    scmos = np.maximum(1.1 * np.exp(pixels.normal(0.0, 0.25, side)), tail)
 
     # the same sources in four times the empty frame, their pixels within the smaller one too
     inner, outer = (
@@ -272,6 +275,7 @@ def main() -> int:
                 ("a map of read noises", bf.PoissonNoise(read_noises)),
                 ("a map below 1", bf.PoissonNoise(0.25 * read_noises)),
                 ("a map around 1", bf.PoissonNoise(0.5 * read_noises)),
+                ("a map of an sCMOS camera", bf.PoissonNoise(scmos)),
                 ("a flat field", bf.FlatFieldNoise(bf.PoissonNoise(), flat)),
                 ("flat field, read noise 2", bf.FlatFieldNoise(bf.PoissonNoise(2.0), flat)),
                 ("flat field, a map", bf.FlatFieldNoise(bf.PoissonNoise(read_noises), flat)),

@@ -235,6 +235,42 @@ def test_wide_frames_and_extreme_pixels_are_summed_pixel_by_pixel(case: str) -> 
         assert np.isfinite(noise.log_likelihood(counts, np.full(WIDE, 1e-12), 0.0)).all()
 
 
+NARROW = (13, 1103)  # no multiples of anything
+TAIL = np.where(RNG.random(NARROW) < 0.05, RNG.uniform(2.0, 6.0, NARROW), 0.0)
+SIDES: dict[str, Floats] = {
+    "uniform": RNG.uniform(0.5, 1.5, NARROW),
+    "sCMOS": np.maximum(1.1 * np.exp(RNG.normal(0.0, 0.25, NARROW)), TAIL),
+    "amplifiers": np.where(np.arange(1103) < 597, 0.7, 2.0) * np.ones(NARROW),
+}
+
+
+@pytest.mark.parametrize("has_flat", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", SIDES)
+def test_maps_on_both_sides_of_1_are_summed_as_by_scipy(case: str, has_flat: bool) -> None:
+    # sources in two corners and on their own, so that what they reach begins and ends anywhere
+    x = np.array([-551.0, -300.0, -280.0, 11.0, 551.4])
+    sources = SourceCatalog(x, np.array([-6.4, 0.0, 2.0, 1.0, 6.0]), np.full(5, 2e3))
+    distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
+    model = ForwardModel(Detector(NARROW), sources, GaussianPSF(2.0), distortion)
+    rng, r, background = np.random.default_rng(712), SIDES[case], 0.7
+    response = rng.uniform(0.5, 1.5, NARROW) if has_flat else np.ones(NARROW)
+    own = PoissonNoise(r)
+    noise = bf.FlatFieldNoise(own, response) if has_flat else own
+    image = model.expected_counts([0.0, 0.0], background)
+    counts, mask = own.draw(image * response, 0.0, rng) / response, rng.random(NARROW) < 0.9
+    mu, n = (image * response)[mask], (counts * response)[mask]
+    terms = special.xlogy(k := np.arange(400.0), mu[:, None]) - mu[:, None] - special.gammaln(k + 1)
+    terms -= 0.5 * ((n[:, None] - k) / r[mask][:, None]) ** 2
+    exact = special.logsumexp(terms, axis=1) - np.log(r[mask] * math.sqrt(2.0 * math.pi))
+    exact += np.log(response[mask])
+    posterior = Posterior(model, counts, noise=noise, mask=mask)
+    params = np.array([0.0, 0.0, background])
+    values = posterior.log_prob(np.tile(params, (4, 1))) - posterior.log_prior(params)[0]
+    assert values == pytest.approx(math.fsum(exact), abs=1e-5 * np.count_nonzero(r[mask] >= 1.0))
+    assert np.ptp(values) == 0.0  # whichever thread evaluates it
+    assert np.abs(exact).max() > 1.0 and np.abs(exact).min() > 0.2  # a pixel's part would be seen
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(k, marks=[pytest.mark.long] * (k == "map")) for k in FRAMES]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
@@ -21,13 +21,14 @@ from bayesfred.model.kernels.contexts import LIMIT, MASKED
 from bayesfred.model.kernels.cumulants import CumulantTable
 from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
 from bayesfred.model.kernels.poisson_gaussian import (
+    WIDE,
     at,
     density_of,
     derivatives_of,
     kind_of,
     steps,
 )
-from bayesfred.model.kernels.read_noise_sums import sum_up
+from bayesfred.model.kernels.read_noise_sums import GROUP, Alike, sum_up
 
 VALUE_TERMS = 12
 INFORMATION_TERMS = 6
@@ -58,6 +59,7 @@ class ReadNoiseTerms(NamedTuple):
     kind: tuple[int, ...]  # see `kind_of`
     variance: float | Floats  # of the read noise, counts^2: one number, or for padded rows
     steps: tuple[Floats, Floats] | None  # see `steps`, of a frame whose pixels need the sum
+    alike: tuple[Alike, Alike] | None  # of a frame some of whose pixels need the sum
     row: float | Floats  # in the table of information
     first: Floats  # these three are `InformationRows`
     step: Floats
@@ -267,6 +269,21 @@ def frame_steps(values: Floats, variance: Floats) -> tuple[Floats, Floats]:
     return up, down
 
 
+def alike_pixels(values: Floats, variance: Floats) -> tuple[Alike, Alike]:
+    """The pixels of padded rows that need the sum, and those that need the expansion."""
+    few, many = (
+        _alike(values.ravel(), variance, values.ravel() > LIMIT, wide) for wide in (False, True)
+    )
+    return few._replace(constants=frame_steps(few.counts, *few.constants)), many
+
+
+def _alike(values: Floats, variance: Floats, used: Flags, wide: bool) -> Alike:
+    chosen = used & ((variance >= WIDE) == wide)
+    first = np.append(0, np.cumsum(np.count_nonzero(chosen.reshape(-1, SEGMENT), axis=1)))
+    counts, own = (np.append(each[chosen], np.ones(GROUP)) for each in (values, variance))
+    return Alike(first, np.flatnonzero(chosen).astype(np.int32), counts, (own,))
+
+
 def _typical_level(counts: Floats, variance: float) -> float:
     """About the level of the sky: the mean of the counts within 3 sd of it."""
     level = float(np.median(counts)) if counts.size else 1.0
@@ -303,4 +320,4 @@ def new_terms(
     variance: float | Floats, rows: InformationRows, row: float | Floats
 ) -> ReadNoiseTerms:
     """The compiled half for pixels in the order in which they are given, without a frame."""
-    return ReadNoiseTerms(kind_of(variance), variance, None, row, *rows, no_series(), None)
+    return ReadNoiseTerms(kind_of(variance), variance, None, None, row, *rows, no_series(), None)

@@ -4,15 +4,20 @@ The formulas are those of `poisson_gaussian`. They take long chains of operation
 waits for the one before, and a processor works on a pixel's and its neighbours' chains at a time
 only if these are short. So a stretch is summed in several passes, whose results stay in the fastest
 cache in between. A table is read one number at a time, because instructions that gather several are
-slower. The logarithm of four pixels' factors is that of their product.
+slower. The logarithm of four pixels' factors is that of their product. Where some pixels need one
+formula and some the other, what a frame knows of them is sorted by formula beforehand, and a sum
+gathers their means alone.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from numba import types
 from numba.extending import overload
 
+from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import inner, leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log, split
@@ -23,7 +28,6 @@ from bayesfred.model.kernels.poisson_gaussian import (
     LEAST,
     REACH,
     TINY,
-    WIDE,
     correction,
     density_of,
     improved,
@@ -34,6 +38,20 @@ from bayesfred.model.kernels.poisson_gaussian import (
     rougher_omega,
     tilted_mean,
 )
+
+GROUP = 16  # gathered pixels come in whole groups: loops are slow where they end within a vector
+
+
+class Alike(NamedTuple):
+    """The pixels in a frame's likelihood that need the same formula, in the frame's order.
+
+    So those of some successive segments lie one after another here, too.
+    """
+
+    first: Ints  # (segments + 1,) number of the first one in a segment or later
+    place: npt.NDArray[np.int32]  # (n,) in the padded frame
+    counts: Floats  # (n + GROUP,)
+    constants: tuple[Floats, ...]  # likewise; the sum's steps, or the variance of the read noise
 
 
 @leaf(fastmath=REDUCE, error_model="numpy")
@@ -123,10 +141,10 @@ def _sum_segments(table, noise, values, mean, place):
 
 @leaf(fastmath=FAST, error_model="numpy")
 def _find_x(variance, values, mean, x, inverse, mu):
-    """x, 1 / r^2 and the mean."""
+    """x, 1 / r^2 and the mean, which is MASKED where a pixel does not count."""
     image, level, response = mean
     for i in range(image.size):
-        mu[i] = scaled(image[i] + level, response, i)
+        mu[i] = scaled(image[i] + level, response, i) if values[i] > LIMIT else MASKED
         inverse[i] = 1.0 / variance[i]
         x[i] = rough_x(values[i], max(mu[i], TINY), inverse[i])
 
@@ -156,7 +174,7 @@ def _sum_tilted(variance, values, mu, tilts, v):
     (s, y), total = tilts, 0.0
     for i in range(mu.size):
         term, _, _, spread = improved(values[i], mu[i], variance[i], s[i], y[i])
-        counted = values[i] > LIMIT
+        counted = mu[i] > LIMIT
         v[i] = spread if counted else 1.0
         term = term if mu[i] >= 0.0 else MASKED
         total += term if counted else 0.0
@@ -164,11 +182,11 @@ def _sum_tilted(variance, values, mu, tilts, v):
 
 
 @leaf(fastmath=REDUCE, error_model="numpy")
-def _sum_corrections(variance, values, v):
+def _sum_corrections(variance, mu, v):
     total = 0.0
     for i in range(v.size):
         term = correction(v[i], variance[i])
-        total += term if values[i] > LIMIT else 0.0
+        total += term if mu[i] > LIMIT else 0.0
     return total
 
 
@@ -198,16 +216,16 @@ def _sum_expansion(variance, values, mean, scratch):
         _find_tilt(n, s, y, v)
         _find_means(mu, s, y)
         total += _sum_tilted(r, n, mu, (s, y), v)
-        total += _sum_corrections(r, n, v) - 0.5 * _sum_logs(v)
+        total += _sum_corrections(r, mu, v) - 0.5 * _sum_logs(v)
     return total
 
 
 @leaf(fastmath=FAST, error_model="numpy")
 def _find_sums(steps, values, mean, sums, mu):
-    """The photon sums, and the mean."""
+    """The photon sums, and the mean, which is MASKED where a pixel does not count."""
     (up, down), (image, level, response) = steps, mean
     for i in range(image.size):
-        mu[i] = scaled(image[i] + level, response, i)
+        mu[i] = scaled(image[i] + level, response, i) if values[i] > LIMIT else MASKED
         sums[i] = photon_sum(nearest(values[i]), max(mu[i], LEAST), up[i], down[i])
 
 
@@ -219,7 +237,7 @@ def _sum_powers(values, mu, sums):
         exponent, mantissa = split(sums[i])
         term = (nearest(values[i]) - REACH) * log(max(mu[i], LEAST)) - mu[i]
         term += exponent * math.log(2.0)
-        counted = values[i] > LIMIT
+        counted = mu[i] > LIMIT
         sums[i] = mantissa if counted else 1.0
         term = term if mu[i] >= 0.0 else MASKED
         total += term if counted else 0.0
@@ -239,27 +257,32 @@ def _sum_photons(steps, values, mean, scratch):
 
 
 @leaf(fastmath=FAST)
-def _select(variance, values, wide, out):
-    """The counts of pixels that have wide read noise, or not, the others MASKED; how many count."""
-    count = 0
-    for i in range(out.size):
-        chosen = (values[i] > LIMIT) & ((variance[i] >= WIDE) == wide)
-        out[i] = values[i] if chosen else MASKED
-        count += chosen
-    return count
+def _gather(place, start, mean, mu):
+    """The means of pixels in these places, and MASKED up to a whole group; how many that makes."""
+    image, level, response = mean
+    for i in range(place.size):
+        j = np.uint64(place[i] - start)
+        mu[i] = scaled(image[j] + level, response, j)
+    filled = (place.size + GROUP - 1) // GROUP * GROUP
+    for i in range(place.size, filled):
+        mu[i] = MASKED
+    return filled
 
 
 @leaf()
-def _sum_mixed(variance, steps, values, mean, scratch):
+def _sum_mixed(few, many, mean, place):
     """The sum over pixels some of which need one formula, some the other."""
-    (up, down), total = steps, 0.0
-    for a in range(0, values.size, STRETCH):
-        n, r = scratch[4, : values[a : a + STRETCH].size], variance[a : a + STRETCH]
-        b, part = a + n.size, part_of(mean, a, n.size)
-        if _select(r, values[a:b], True, n) > 0:
-            total += _sum_expansion(r, n, part, scratch)
-        if _select(r, values[a:b], False, n) > 0:
-            total += _sum_photons((up[a:b], down[a:b]), n, part, scratch)
+    (start, scratch), total = place, 0.0
+    begin, end, mu = start // SEGMENT, (start + mean[0].size) // SEGMENT, scratch[4]
+    (up, down), variance, last = few.constants, many.constants[0], few.first[end]
+    for a in range(few.first[begin], last, STRETCH):
+        b = a + _gather(few.place[a : min(a + STRETCH, last)], start, mean, mu)
+        own = (mu[: b - a], 0.0, None)
+        total += _sum_photons((up[a:b], down[a:b]), few.counts[a:b], own, scratch)
+    last = many.first[end]
+    for a in range(many.first[begin], last, STRETCH):
+        b = a + _gather(many.place[a : min(a + STRETCH, last)], start, mean, mu)
+        total += _sum_expansion(variance[a:b], many.counts[a:b], (mu[: b - a], 0.0, None), scratch)
     return total
 
 
@@ -290,9 +313,5 @@ def _choose_sum(noise: Any, values: Any, mean: Any, place: Any) -> Any:
             noise.variance[place[0] : place[0] + values.size], values, mean, place[1]
         )
     return lambda noise, values, mean, place: _sum_mixed(
-        noise.variance[place[0] : place[0] + values.size],
-        _steps_of(noise, place[0], values.size),
-        values,
-        mean,
-        place[1],
+        noise.alike[0], noise.alike[1], mean, place
     )

@@ -27,6 +27,7 @@ from bayesfred.model.kernels.read_noise import (
     CELLS,
     InformationRows,
     ReadNoiseTerms,
+    alike_pixels,
     frame_steps,
     informations,
     level_series,
@@ -175,7 +176,9 @@ def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     level = level_series(terms, values, float(np.median(np.square(read_noise))))
     if isinstance(read_noise, float):
         terms = terms._replace(cumulants=cumulant_table(read_noise**2, values, SEGMENT))
-    elif len(terms.kind) != 1:
+    elif len(terms.kind) == 2:
+        terms = terms._replace(alike=alike_pixels(values, read_noise**2))
+    elif len(terms.kind) == 0:
         terms = terms._replace(steps=frame_steps(values, read_noise**2))
     return terms._replace(level=level)
 
