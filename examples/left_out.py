@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesfred import pipeline, settings
+from bayesfred import settings
 from bayesfred.analysis.folds import fold_sources
 from bayesfred.analysis.left_out import Weights, leave_out
+from bayesfred.commands import pipeline
 from bayesfred.io.paths import resolve
 
 FOLDS, ROUNDS = 20, 5

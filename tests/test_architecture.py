@@ -6,6 +6,7 @@ Every rule is a function of source text: each is also shown to fail on a text th
 import ast
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -115,6 +116,12 @@ def test_heavy_packages_are_loaded_when_they_are_needed() -> None:
         )
         assert loaded(said) <= {"pydantic"}  # which typer uses to read arguments
     assert "scipy" in loaded("import bayesfred\nbayesfred.Detector")
+
+
+@pytest.mark.parametrize("script", sorted(ROOT.glob("examples/*.py")), ids=lambda path: path.stem)
+def test_examples_find_what_they_import(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(script.parent))
+    runpy.run_path(str(script), run_name="imported")
 
 
 # --- places of one machine ------------------------------------------------------------------------
