@@ -51,7 +51,7 @@ def test_planted_pixels_are_found_and_nothing_else(fwhm: float) -> None:
         found[kind] = others[kind] = 0
         for _ in range(FRAMES):
             posterior, changed = posterior_of(fwhm, rng, kind)
-            sharp = sharp_pixels(posterior, bf.find_map(posterior))
+            sharp = sharp_pixels(posterior, bf.find_map(posterior).params)
             found[kind] += int(sharp[changed].sum())
             others[kind] += int(sharp[~changed].sum())
     assert found["hot"] >= 28 and found["dead"] >= 18, found

@@ -22,7 +22,6 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
-from bayesfred.optimize.sharp_pixels import sharp_pixels
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
@@ -101,16 +100,10 @@ def read_frame(
             note(*choice.lines())
         if has_pixel(posterior.model.psf) or rough:
             with working("measuring the PSF", show=say is not None):
-                measured = _with_measured_psf(posterior, estimate, psf, run)
-                sharp = sharp_pixels(*measured) & f.reject_outliers
-            if found := int(sharp.sum()):
-                note(
-                    f"{found} pixel{'s' * (found > 1)} within images, sharper than the PSF: masked"
-                )
-                posterior = replace(posterior, mask=posterior.mask & ~sharp, extrapolation=None)
-                with working("measuring the PSF again", show=say is not None):
-                    measured = _with_measured_psf(posterior, estimate, psf, run)
-            posterior, estimate = measured
+                measured, estimate = _with_measured_psf(posterior, estimate, psf, run)
+            if n := int(np.sum(posterior.mask & ~measured.mask)):
+                note(f"{n} pixel{'s' * (n > 1)} within images, sharper than the PSF: masked")
+            posterior = measured
             note(psf_message(posterior, estimate))
     return posterior, estimate, notes
 
@@ -142,6 +135,7 @@ def _with_measured_psf(
         return measure_psf(
             posterior, estimate, oversampling=psf.oversampling, degree=psf.degree,
             model_error=run.nuisances.model_error, prior=build.priors_given(run),
+            reject_outliers=run.frame.reject_outliers,
         )  # fmt: skip
     posterior = marginalize_psf(posterior, estimate)
     return posterior, find_map(posterior, estimate.params)

@@ -99,7 +99,11 @@ def fit_psf(
 
 
 def find_psf(
-    posterior: Posterior, estimate: MapEstimate, oversampling: int, degree: int
+    posterior: Posterior,
+    estimate: MapEstimate,
+    oversampling: int,
+    degree: int,
+    start: PsfState | None = None,
 ) -> tuple[MeasuredPSF, PsfState, Floats]:
     """Measure the PSF as `fit_psf` does, and keep what its errors are made of.
 
@@ -108,6 +112,8 @@ def find_psf(
     posterior : Posterior
     estimate : MapEstimate
     oversampling, degree : int
+    start : PsfState, optional
+        The solution for nearly the same pixels.
 
     Returns
     -------
@@ -124,7 +130,8 @@ def find_psf(
             "PSF has one pixel in it; describe the frame in recorded pixels"
         )
     with one_blas_thread():
-        equations = solved(posterior, _start(posterior, estimate, float(oversampling), degree))
+        begin = start or _start(posterior, estimate, float(oversampling), degree)
+        equations = solved(posterior, begin)
         wider = _with_wings(posterior, equations.state)
         if _light_beyond(posterior, wider) > WINGS_SEEN:
             equations = solved(posterior, wider)

@@ -14,8 +14,9 @@ from bayesfred.model.psf_errors import OccamFactor, PsfErrors
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_psf import find_psf
-from bayesfred.optimize.newton import maximize
+from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.psf_marginal import occam_factor, shared_information
+from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 LARGEST_ERROR = 0.1  # where the search for a model error begins: with more, misfits grow
 
@@ -28,6 +29,7 @@ def measure_psf(
     degree: int = 0,
     model_error: bool = False,
     prior: Mapping[str, Any] | None = None,
+    reject_outliers: bool = False,
 ) -> tuple[Posterior, MapEstimate]:
     """Measure the PSF of a frame, and maximise the posterior with it.
 
@@ -43,6 +45,9 @@ def measure_psf(
         the frame's it would only slow the search.
     prior : mapping from str to frozen distribution, optional
         Where this has one of the model error.
+    reject_outliers : bool
+        Mask single pixels within images that are sharper than the PSF, hot or dead ones and cosmic
+        rays, and measure it without them.
 
     Returns
     -------
@@ -70,13 +75,35 @@ def measure_psf(
     >>> estimate.fits_data, measured.fits_data
     (False, True)
     """
+    given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
     psf, state, drawn = find_psf(posterior, estimate, oversampling, degree)
+    bare, top = _near(posterior, estimate, psf, model_error, given)
+    if reject_outliers and np.any(sharp := sharp_pixels(bare, top.params)):
+        posterior = replace(posterior, mask=posterior.mask & ~sharp, extrapolation=None)
+        psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, state)
+        bare, top = _near(posterior, estimate, psf, model_error, given)
+    if bare.model.optics().translates:
+        slopes = drawn @ shared_information(bare, state, top.params)
+    else:
+        slopes = _gradients(bare, psf, top.params)
+    occam = occam_factor(bare, state, top.params) if bare.nuisances.model_error else None
+    measured = _marginalized(bare, slopes, top.params, psf.determined, occam)
+    return measured, find_map(measured, top.params)
+
+
+def _near(
+    posterior: Posterior,
+    estimate: MapEstimate,
+    psf: MeasuredPSF,
+    model_error: bool,
+    prior: Mapping[str, Any],
+) -> tuple[Posterior, NewtonResult]:
+    """The posterior with a PSF but without the PSF's errors, and its maximum."""
     bare = posterior.with_psf(psf)
     known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
     if model_error:
-        given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
         bare = replace(
-            bare, nuisances=replace(bare.nuisances, model_error=True), prior={**bare.prior, **given}
+            bare, nuisances=replace(bare.nuisances, model_error=True), prior={**bare.prior, **prior}
         )
     known.setdefault("model_error", min(max(psf.model_error, 1e-3), LARGEST_ERROR))
     start = np.array([known[name] for name in bare.parameter_names])
@@ -86,14 +113,7 @@ def measure_psf(
             "resemble each other: reject outliers (reject_outliers), mask what is no source's, or "
             "let the PSF vary less over the field (degree)"
         )
-    top = maximize(bare, start)
-    if bare.model.optics().translates:
-        slopes = drawn @ shared_information(bare, state, top.params)
-    else:
-        slopes = _gradients(bare, psf, top.params)
-    occam = occam_factor(bare, state, top.params) if bare.nuisances.model_error else None
-    measured = _marginalized(bare, slopes, top.params, psf.determined, occam)
-    return measured, find_map(measured, top.params)
+    return bare, maximize(bare, start)
 
 
 def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:

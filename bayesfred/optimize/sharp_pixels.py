@@ -12,7 +12,6 @@ from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.outliers import SIGNIFICANCE
 from bayesfred.optimize.uncatalogued import COMMON, MOST_BESIDE, SHARP, SHARPEST
 
@@ -20,14 +19,14 @@ BRIGHT = 10.0  # standard deviations of the noise: light that tells what the PSF
 COMMON_SD = 1.15  # standard deviations that `COMMON` of normal residuals do not exceed
 
 
-def sharp_pixels(posterior: Posterior, estimate: MapEstimate) -> Flags:
+def sharp_pixels(posterior: Posterior, params: Floats) -> Flags:
     """Find the pixels whose residuals exceed the noise and are sharper than the PSF.
 
     Parameters
     ----------
     posterior : Posterior
         With the PSF that was measured on the frame.
-    estimate : MapEstimate
+    params : ndarray, shape (d,)
         Its maximum.
 
     Returns
@@ -35,7 +34,7 @@ def sharp_pixels(posterior: Posterior, estimate: MapEstimate) -> Flags:
     ndarray of bool, shape (ny, nx)
         Such pixels of the posterior.
     """
-    params, mask = estimate.params, posterior.mask
+    mask = posterior.mask
     expected = posterior.expected_counts(params)
     background = posterior.likelihood.background(params)
     level = params[posterior.parameter_names.index("background")]
