@@ -43,7 +43,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from bayesfred.imaging.kernels import compilation
 if "numba alone" in sys.argv:
-    compilation._Cache = lambda function, is_shared: compilation.FunctionCache(function)
+    compilation._Cache = lambda function: compilation.FunctionCache(function)
 if "not asked" in sys.argv:
     compilation._Call.is_there = lambda call: True
 from bayesfred.imaging.kernels.caller import linear, value
@@ -202,3 +202,33 @@ def test_a_shared_function_is_no_part_of_its_callers(
         "print(sum('declare' in line and 'twice' in line for line in code.splitlines()))"
     )
     assert printed(package, ask, *arguments) == (0.0 if arguments else 1.0)
+
+
+RAISING = """
+from bayesfred.imaging.kernels.compilation import entry, inner
+
+@inner()
+def root(x):
+    if x < 0.0:
+        raise ValueError("negative", x)
+    return x**0.5
+
+@entry()
+def value(x):
+    return root(x)
+
+try:
+    value(-3.0)
+except ValueError as error:
+    print(error.args)
+"""
+
+
+def test_errors_of_functions_that_are_linked_in_keep_their_values(tmp_path):
+    program = tmp_path / "raising.py"
+    program.write_text(RAISING)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    for _ in ("compiled", "read"):
+        command = [sys.executable, str(program)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout == "('negative', -3.0)\n"

@@ -21,6 +21,8 @@ import numba as nb
 from llvmlite import binding
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.types import BaseNamedTuple, BaseTuple  # type: ignore[attr-defined]
 
 PATIENCE = 60.0  # seconds for which another process may compile a function
@@ -118,9 +120,9 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     _impl_class = _CompileResults
 
-    def __init__(self, function: Callable[..., Any], is_shared: bool) -> None:
+    def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._function = function if is_shared else None
+        self._function = function
         self._compiling: dict[Any, filelock.BaseFileLock] = {}
 
     def _select(self, sig: Any) -> bool:
@@ -155,6 +157,9 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return found
 
     def _save_overload(self, sig: Any, data: Any) -> None:
+        # what was linked in raises errors by these, and no machine code of its own has set them
+        for env in data._find_referenced_environments():
+            data.library.codegen.set_env(env.env_name, env)
         try:
             if self._select(sig):
                 super()._save_overload(sig, data)
@@ -164,10 +169,9 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def _share(self, sig: Any, cres: Any) -> None:
         """Give the callers of a shared function its name in place of its code."""
-        if self._function is not None:
-            library, name = cres.library, cres.fndesc.llvm_func_name
-            library.calls = {_Call(self._function.__module__, self._function.__name__, sig, name)}
-            library._shared_module = binding.parse_assembly("")
+        library, name = cres.library, cres.fndesc.llvm_func_name
+        library.calls = {_Call(self._function.__module__, self._function.__name__, sig, name)}
+        library._shared_module = binding.parse_assembly("")
 
     def _lock_path(self, sig: Any) -> Path:
         name = f"{self._impl.filename_base} {sig}".encode()
@@ -180,21 +184,59 @@ class _Cache(FunctionCache):  # type: ignore[misc]
                 Path(lock.lock_file).unlink(missing_ok=True)
 
 
+class _Part(JITCodeLibrary):  # type: ignore[misc]
+    """A library that is only linked into others, and so is never turned into machine code."""
+
+    @property
+    def codegen(self) -> "_Part":
+        return self
+
+    def set_env(self, name: str, env: Any) -> None:
+        """Set nothing: the callers' machine code has it, see `_Cache`."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Optimise the library; the pointer is null, as that of a wrapper that is missing."""
+        self._ensure_finalized()
+        return 0
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):  # type: ignore[misc]
+    """Compiles what only compiled code calls, and links it into that of its callers."""
+
+    def define_pipelines(self) -> Any:
+        state = self.state
+        state.library = _Part(state.targetctx.codegen(), state.func_id.func_qualname)
+        return super().define_pipelines()
+
+
+# Options of what is compiled into its callers. Wrappers for other callers would take as long to
+# compile as a small function itself.
+INLINED: dict[str, Any] = {
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "pipeline_class": _PartCompiler,
+}
+
+
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function that Python calls, and keep its machine code on disk.
 
     Compiled code may call it too, as it does what is `shared`. The options are those of
     `numba.njit`.
     """
-    return partial(_compiled, is_shared=True, nogil=True, **options)
+    return partial(_compiled, is_shared=True, nogil=True, no_cfunc_wrapper=True, **options)
 
 
 def inner(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function that only compiled code calls; Python must not, it would crash.
 
-    Wrappers for other callers would add a seventh to the time of compilation.
+    Its code is kept on disk only within that of its callers.
     """
-    return partial(_compiled, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+    return partial(_compiled, **INLINED, **options)
 
 
 def leaf(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -219,7 +261,8 @@ def shared(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def _compiled(function: Callable[..., Any], is_shared: bool = False, **options: Any) -> Any:
     # a function without the option would take it from the first that calls it
     dispatcher = nb.njit(**{"_nrt": True} | options)(function)
-    dispatcher._cache = _Cache(function, is_shared)
+    if is_shared:
+        dispatcher._cache = _Cache(function)
     return dispatcher
 
 

@@ -19,10 +19,10 @@ from numba.core.types import NoneType  # type: ignore[attr-defined]
 from numba.extending import overload
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import inner, shared
+from bayesfred.imaging.kernels.compilation import INLINED, inner, shared
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import one_source
-from bayesfred.imaging.kernels.psf_dispatch import INLINED, by_type, psf_line
+from bayesfred.imaging.kernels.psf_dispatch import by_type, psf_line
 
 
 class Lines(NamedTuple):

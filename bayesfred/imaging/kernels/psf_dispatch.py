@@ -40,10 +40,8 @@ from typing import Any
 
 from numba.extending import overload
 
+from bayesfred.imaging.kernels.compilation import INLINED
 from bayesfred.imaging.kernels.polynomials import map_on_row, polynomial_on_row
-
-# Without wrappers for other callers, which take as long to compile as such a function itself.
-INLINED = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def by_type(choice: Callable[[Any], Callable[..., Any]]) -> Callable[..., Any]:
