@@ -84,7 +84,7 @@ class PixelGrid(NamedTuple):
     step: float
 
 
-@inner()
+@leaf()
 def pixel_grid(layout):
     """The grid of a layout's frame."""
     o = layout.optics
@@ -116,7 +116,7 @@ def new_rows(layout, basis, width):
     return Rows(sampler, o.offsets, o.weights, o.ramp, f, g, is_wider, out, samples, powers)
 
 
-@inner()
+@leaf()
 def widens(basis):
     """Whether the width is a parameter: it is the last, then."""
     size = basis.row.size
@@ -315,11 +315,11 @@ def second_derivatives(layout, rows, s, flux):
 
     `rows` are those of a basis with the monomial 1 alone.
     """
-    o, fp, grid, out = layout.optics, layout.footprints, pixel_grid(layout), rows.out
+    fp, grid, out = layout.footprints, pixel_grid(layout), rows.out
     first, last = fp.first[s], fp.first[s + 1]
     source, begin = one_source(layout.geometry, s), fp.start[first]
     second = np.empty((3, fp.start[last] - begin))
-    lines = lines_of(o.translates, o.psf, layout, s, first, last)
+    lines = lines_of(layout, s, first, last)
     if fill_second_derivatives(lines, fp, s, flux, second):
         return second
     for p in range(first, last):
@@ -346,32 +346,33 @@ def _add_derivatives(flux, factors, index, basis_rows, out):
                 target[i] += c * derivative[i]
 
 
-@shared(fastmath=FAST)
+@leaf(fastmath=FAST)
+def _add_source_rows(place, basis, rows, flux, band, out):
+    """Add the derivatives of a source in rows band[0] to band[1] - 1."""
+    (layout, s, lines), (first, last) = place, band
+    fp, grid, inverse = layout.footprints, pixel_grid(layout), 1.0 / layout.sigma
+    source, lows, sizes, numbers = one_source(layout.geometry, s), fp.low, fp.size, fp.row
+    factors, index, basis_rows = basis.factors[s], basis.row, rows.out
+    monomials = len(rows.f), len(rows.g), rows.is_wider
+    for p in range(fp.first[s], fp.first[s + 1]):
+        j, low, n = numbers[p], lows[p], sizes[p]
+        if not first <= j < last:
+            continue
+        if not is_product_row(lines, monomials, inverse, (j, low, n), basis_rows):
+            u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
+            basis_row(rows, source, u, v, n, np.int64(0))
+        _add_derivatives(flux, factors, index, basis_rows, out[:, j - first, low : low + n])
+
+
+@shared()
 def add_jacobian_rows(layout, basis, flux, first, last, out):
     """Add the derivatives of rows first..last-1 to out (parameters, rows, padded row)."""
-    rows, fp, grid = new_rows(layout, basis, out.shape[2]), layout.footprints, pixel_grid(layout)
-    begins, lows, sizes, numbers = fp.first, fp.low, fp.size, fp.row
-    factors, index, basis_rows, reached = basis.factors, basis.row, rows.out, layout.geometry.rows
-    o, inverse, monomials = (
-        layout.optics,
-        1.0 / layout.sigma,
-        (len(rows.f), len(rows.g), rows.is_wider),
-    )
+    rows = new_rows(layout, basis, out.shape[2])
+    begins, reached = layout.footprints.first, layout.geometry.rows
     for s in range(flux.size):
-        if reached[s, 0] >= last or reached[s, 1] <= first:
-            continue
-        source = one_source(layout.geometry, s)
-        lines = lines_of(o.translates, o.psf, layout, s, begins[s], begins[s + 1])
-        for p in range(begins[s], begins[s + 1]):
-            j, low, n = numbers[p], lows[p], sizes[p]
-            if not first <= j < last:
-                continue
-            if not is_product_row(lines, monomials, inverse, (j, low, n), basis_rows):
-                u, v = (low - grid.middle_u) * grid.step, (j - grid.middle_v) * grid.step
-                basis_row(rows, source, u, v, n, np.int64(0))
-            _add_derivatives(
-                flux[s], factors[s], index, basis_rows, out[:, j - first, low : low + n]
-            )
+        if reached[s, 0] < last and reached[s, 1] > first:
+            lines = lines_of(layout, s, begins[s], begins[s + 1])
+            _add_source_rows((layout, s, lines), basis, rows, flux[s], (first, last), out)
 
 
 @entry()

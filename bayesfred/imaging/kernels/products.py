@@ -19,10 +19,10 @@ from numba.core.types import NoneType  # type: ignore[attr-defined]
 from numba.extending import overload
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import INLINED, inner, shared
+from bayesfred.imaging.kernels.compilation import INLINED, leaf, shared
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.imaging.kernels.geometry import one_source
-from bayesfred.imaging.kernels.psf_dispatch import by_type, psf_line
+from bayesfred.imaging.kernels.psf_dispatch import psf_line
 
 
 class Lines(NamedTuple):
@@ -37,7 +37,7 @@ class Lines(NamedTuple):
     top: int  # and row
 
 
-@inner(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST, error_model="numpy")
 def _fill_line(o, t0, inverse, factor, out):
     """Fill a line of pixels whose middles are at a = t0 + ramp."""
     out[:] = 0.0
@@ -72,19 +72,19 @@ def _product_lines(layout, s, first, last):
     return Lines(columns, rows, low, top)
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _add_line(line, factor, out):
     for i in range(out.size):
         out[i] += factor * line[i]
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _add_two(first, by_first, second, by_second, out):
     for i in range(out.size):
         out[i] += by_first * first[i] + by_second * second[i]
 
 
-@inner(fastmath=FAST)
+@leaf(fastmath=FAST)
 def _set_line(line, factor, out):
     for i in range(out.size):
         out[i] = factor * line[i]
@@ -104,7 +104,7 @@ def add_product(layout, s, rows, flux, canvas, alone):
             _set_line(line, factor, alone.image[alone.at[i] : alone.at[i] + n])
 
 
-@shared()
+@shared(_nrt=False)
 def add_product_templates(lines, fp, s, flux, stamps, wider):
     """Do what `render.add_templates` does; False without lines."""
     if lines is None:
@@ -120,7 +120,7 @@ def add_product_templates(lines, fp, s, flux, stamps, wider):
     return True
 
 
-@shared()
+@shared(_nrt=False)
 def product_basis_row(lines, basis, inverse, j, low, out):
     """The rows of a basis on row j from column `low` on, see `jacobian.basis_row`.
 
@@ -140,7 +140,7 @@ def product_basis_row(lines, basis, inverse, j, low, out):
         _add_two(a[3], inverse * b[0], a[0], inverse * (b[3] - 2.0 * b[0]), row)
 
 
-@inner()
+@leaf()
 def is_product_row(lines, basis, inverse, place, out):
     """Do what `product_basis_row` does at (j, low, pixels); False without lines."""
     if lines is None:
@@ -149,7 +149,7 @@ def is_product_row(lines, basis, inverse, place, out):
     return True
 
 
-@shared()
+@shared(_nrt=False)
 def fill_second_derivatives(lines, fp, s, flux, out):
     """Do what `jacobian.second_derivatives` does; False without lines."""
     if lines is None:
@@ -164,7 +164,7 @@ def fill_second_derivatives(lines, fp, s, flux, out):
     return True
 
 
-@inner(fastmath=REDUCE)
+@leaf(fastmath=REDUCE)
 def _three_dots(weight, first, second, third):
     one, two, three = 0.0, 0.0, 0.0
     for i in range(weight.size):
@@ -174,7 +174,7 @@ def _three_dots(weight, first, second, third):
     return one, two, three
 
 
-@shared()
+@shared(_nrt=False)
 def product_sums(lines, fp, s, template, weight):
     """Sums of a weight times P, P_a, P_b and a P_a + b P_b over the pixels of source s.
 
@@ -196,29 +196,6 @@ def product_sums(lines, fp, s, template, weight):
     return True, total, by_a, by_b, wide
 
 
-def _lines_of(psf, layout, s, first, last):
-    return _product_lines(layout, s, first, last)
-
-
-def _no_lines(psf, layout, s, first, last):
-    return None
-
-
-_some_lines = by_type(lambda family: _lines_of if hasattr(family, "line") else _no_lines)
-
-
-@inner()
-def lines_of(translates, psf, layout, s, first, last):
-    """The lines of source s over the rows of the footprints from first to last - 1.
-
-    They are None, a type of its own for which nothing else here is compiled, where images are no
-    products: without `translates`, or of a PSF that is none.
-    """
-    if translates is None:
-        return None
-    return _some_lines(psf, layout, s, first, last)
-
-
 def by_image(product: Callable[..., Any], sampled: Callable[..., Any]) -> Callable[..., Any]:
     """A function of a layout that has another code where images are products."""
 
@@ -233,3 +210,16 @@ def by_image(product: Callable[..., Any], sampled: Callable[..., Any]) -> Callab
         return product if is_product else sampled
 
     return function
+
+
+def _some_lines(layout, s, first, last):
+    return _product_lines(layout, s, first, last)
+
+
+def _no_lines(layout, s, first, last):
+    return None
+
+
+# The lines of source s over the rows of the footprints from first to last - 1. They are None, a
+# type of its own for which nothing else here is compiled, where images are no products.
+lines_of = by_image(_some_lines, _no_lines)

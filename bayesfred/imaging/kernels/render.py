@@ -95,7 +95,7 @@ def add_templates(layout, s, flux, stamps, wider):
     sigma.
     """
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
-    lines = lines_of(o.translates, o.psf, layout, s, fp.first[s], fp.first[s + 1])
+    lines = lines_of(layout, s, fp.first[s], fp.first[s + 1])
     if add_product_templates(lines, fp, s, flux, stamps, wider):
         return
     source = one_source(layout.geometry, s)

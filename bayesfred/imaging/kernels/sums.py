@@ -164,14 +164,12 @@ def _sample_sums(layout, source, rows, template, weight, buffers):
     return flux
 
 
-@shared()
-def add_basis_sums(layout, basis, s, template, weight, buffers):
-    """Add to buffers.out[k] the sum over a source's pixels of weight times row k of the basis."""
+@leaf()
+def _add_weighted(place, basis, template, weight, buffers):
+    layout, s, lines = place
     sums, out, degrees = buffers.sums, buffers.out, layout.optics.degrees
-    source, first = one_source(layout.geometry, s), layout.footprints.first
+    source, fp, first = one_source(layout.geometry, s), layout.footprints, layout.footprints.first
     a, b, n_f, n_g = source.a, source.b, basis.f.shape[0], basis.g.shape[0]
-    o, fp = layout.optics, layout.footprints
-    lines = lines_of(o.translates, o.psf, layout, s, first[s], first[s + 1])
     is_product, flux, by_a, by_b, wide = product_sums(lines, fp, s, template, weight)
     if is_product:
         for k in range(n_f):
@@ -196,3 +194,11 @@ def add_basis_sums(layout, basis, s, template, weight, buffers):
         _shift_sums(sums[i], source.u, source.v, degrees.ab)
     _add_sums(basis.f, sums[0], sums[3], sums[4], out[:n_f])
     _add_sums(basis.g, sums[1], sums[5], sums[6], out[n_f : n_f + n_g])
+
+
+@shared()
+def add_basis_sums(layout, basis, s, template, weight, buffers):
+    """Add to buffers.out[k] the sum over a source's pixels of weight times row k of the basis."""
+    first = layout.footprints.first
+    lines = lines_of(layout, s, first[s], first[s + 1])
+    _add_weighted((layout, s, lines), basis, template, weight, buffers)

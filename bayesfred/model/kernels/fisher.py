@@ -49,7 +49,7 @@ class _Band(NamedTuple):
     last: int
 
 
-@inner()
+@leaf()
 def _fill_weight(frame, noise, w, background):
     """Expected information per marked pixel into w.weight, zero where masked.
 
@@ -71,7 +71,7 @@ def _fill_weight(frame, noise, w, background):
     return known
 
 
-@inner()
+@leaf()
 def _fill_background(frame, band, sources):
     """Derivatives with respect to the background's coefficients."""
     out, terms = band.jacobian, band.jacobian.shape[0] - sources

@@ -41,7 +41,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import entry, inner
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Layout
 from bayesfred.imaging.kernels.geometry import layout_of, row_starts
 from bayesfred.imaging.kernels.jacobian import Rows, new_rows, second_derivatives
@@ -113,7 +113,7 @@ def _constants():
     return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
 
 
-@inner()
+@leaf()
 def _add_mixed(touching, s, t, column, out):
     """Add sum_b column[b] T_b of source t, where it overlaps source s, to out, a template of s."""
     fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
@@ -335,7 +335,7 @@ def _fill_images(noise, frame, w, background, h, y):
     return light, level, slope
 
 
-@inner()
+@leaf()
 def _fill_weights(w, fp, a, s, t, out):
     """c_t of source s at every sample of its footprint."""
     flux, z, begin = a.fluxes[s], a.z[s, t], fp.start[fp.first[s]]
@@ -350,6 +350,19 @@ def _fill_weights(w, fp, a, s, t, out):
             template = mixed[t, fp.start[p] : fp.start[p] + n]
             for k in range(n):
                 own[k] += amplitude * (z * score[at + k] - weight[at + k] * template[k])
+
+
+@leaf()
+def _add_sources(layout, basis, w, amplitudes, buffers, out):
+    """Add the sums over all sources' pixels to the gradient."""
+    sums, weights = buffers
+    for s in range(amplitudes.fluxes.size):
+        sums.out[:] = 0.0
+        for t in range(amplitudes.z.shape[1]):
+            _fill_weights(w, layout.footprints, amplitudes, s, t, weights)
+            add_basis_sums(layout, basis, s, t, weights, sums)
+        for k in range(basis.row.size):
+            out[k] += basis.factors[s, k] * sums.out[basis.row[k]]
 
 
 @entry()
@@ -383,11 +396,5 @@ def gradient(problem, w, rendered, parameters, basis, out):
         most = max(most, fp.start[fp.first[s + 1]] - fp.start[fp.first[s]])
     sums, weights = new_sums(o, basis, pitch), np.empty(most)
     amplitudes = _Amplitudes(rendered.fluxes, z, mixed, image, row_starts(fp, pitch))
-    for s in range(o.x.size):
-        sums.out[:] = 0.0
-        for t in range(z.shape[1]):
-            _fill_weights(w, fp, amplitudes, s, t, weights)
-            add_basis_sums(layout, basis, s, t, weights, sums)
-        for k in range(basis.row.size):
-            out[0][k] += basis.factors[s, k] * sums.out[basis.row[k]]
+    _add_sources(layout, basis, w, amplitudes, (sums, weights), out[0])
     return (slope, by_error), z

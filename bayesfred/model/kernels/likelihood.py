@@ -105,7 +105,7 @@ def _mark_sources(fp, w):
             flags[j * per_row + k] = depth > 0
 
 
-@inner()
+@leaf()
 def _mark_counted(frame, w):
     """Mark every segment with a pixel in the likelihood."""
     per_row = w.flags.size // w.span.shape[0]
@@ -214,7 +214,7 @@ def slope_run(part, out):
         out[i] = part.image[i] + x * (part.c1 + x * part.c2)
 
 
-@inner()
+@leaf()
 def add_background_sums(frame, w, image, out):
     """Add the sum of the image times 1, u, v, u^2, uv, v^2 over the marked pixels."""
     pitch = frame.values.size // frame.ny
@@ -234,9 +234,9 @@ def add_background_sums(frame, w, image, out):
             start, stop = next_run(w, j, stop)
 
 
-@shared()
-def unreached_pixels(frame, w):
-    """The pixels that no source reaches."""
+@leaf()
+def _count_unreached(frame, w):
+    """How many pixels no source reaches, and the sum of their counts."""
     per_row = w.flags.size // frame.ny
     pixels, counts = frame.pixels, frame.total
     for j in range(frame.ny):
@@ -244,6 +244,13 @@ def unreached_pixels(frame, w):
             if w.flags[k] != 0:
                 pixels -= frame.segment_pixels[k]
                 counts -= frame.segment_sum[k]
+    return pixels, counts
+
+
+@inner()
+def unreached_pixels(frame, w):
+    """The pixels that no source reaches."""
+    pixels, counts = _count_unreached(frame, w)
     return Unreached(pixels, counts, w.flags)
 
 
