@@ -7,6 +7,7 @@ import pytest
 
 import bayesfred as bf
 from bayesfred._typing import Flags
+from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 FRAMES, PLANTED = 5, 6
@@ -56,3 +57,22 @@ def test_planted_pixels_are_found_and_nothing_else(fwhm: float) -> None:
             others[kind] += int(sharp[~changed].sum())
     assert found["hot"] >= 28 and found["dead"] >= 18, found
     assert max(others.values()) <= 1, others
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("photons", "beta"), [(1e4, 20.0), (1e6, 2.5)])
+def test_a_psf_is_the_same_from_its_own_solution(photons: float, beta: float) -> None:
+    """With the grid for wings, which bright stars need, and without: within 0.1 of its errors."""
+    model = bf.ForwardModel(
+        bf.Detector((121, 121), pixel="box"), bf.SourceCatalog.grid(4, 26.3, photons),
+        bf.MoffatPSF(2.5, beta), bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)]),
+    )  # fmt: skip
+    counts = bf.simulate(model, [1e-3, 0.0], 5.0, seed=3)
+    rough = bf.Posterior(replace(model, psf=bf.GaussianPSF(1.2)), counts)
+    estimate = bf.find_map(rough)
+    cold, state, _ = find_psf(rough, estimate, 4, 0)
+    assert bool(state.grid.wings) == (beta < 3.0)
+    warm, again, _ = find_psf(rough, estimate, 4, 0, state)
+    assert again.grid == state.grid
+    difference = warm.coefficients - cold.coefficients
+    assert np.all(np.abs(difference) <= 0.1 * cold.draws.std(axis=0) + 1e-9)

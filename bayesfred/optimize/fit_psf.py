@@ -132,9 +132,10 @@ def find_psf(
     with one_blas_thread():
         begin = start or _start(posterior, estimate, float(oversampling), degree)
         equations = solved(posterior, begin)
-        wider = _with_wings(posterior, equations.state)
-        if _light_beyond(posterior, wider) > WINGS_SEEN:
-            equations = solved(posterior, wider)
+        if not equations.state.grid.wings:
+            wider = _with_wings(posterior, equations.state)
+            if _light_beyond(posterior, wider) > WINGS_SEEN:
+                equations = solved(posterior, wider)
         return _measured(posterior, equations)
 
 
