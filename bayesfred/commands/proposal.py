@@ -19,6 +19,7 @@ from bayesfred.io.frames import read_stored
 from bayesfred.io.headers import noise_in, units
 from bayesfred.io.paths import may_write
 from bayesfred.io.saturation import plateau
+from bayesfred.optimize.peaks import beside
 from bayesfred.settings.sections import toml_text
 
 STARS = 30  # peaks by which the PSF's width is measured
@@ -175,8 +176,7 @@ def _width(image: Floats) -> float:
         .repeat(4, 0)
         .repeat(4, 1)[: image.shape[0], : image.shape[1]]
     )
-    beside = 9.0 * ndimage.uniform_filter(filled, 3) - filled
-    filled = np.where(beside < SHARP * filled, ndimage.median_filter(filled, 3), filled)
+    filled = np.where(beside(filled) < SHARP * filled, ndimage.median_filter(filled, 3), filled)
     smooth = ndimage.gaussian_filter(filled, 1.0)
     sigma = 1.5
     for _ in range(3):

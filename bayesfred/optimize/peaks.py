@@ -163,3 +163,8 @@ def vertex(image: Floats, row: Ints, column: Ints) -> Floats:
     up = shift(image[np.maximum(row - 1, 0), column], image[np.minimum(row + 1, ny - 1), column])
     right = shift(image[row, np.maximum(column - 1, 0)], image[row, np.minimum(column + 1, nx - 1)])
     return np.stack([row + up, column + right], axis=1)
+
+
+def beside(image: Floats) -> Floats:
+    """The sum of the eight pixels beside each, shape (ny, nx)."""
+    return np.asarray(9.0 * ndimage.uniform_filter(image, 3) - image)

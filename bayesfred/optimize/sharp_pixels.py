@@ -13,6 +13,7 @@ from scipy import ndimage
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.outliers import SIGNIFICANCE
+from bayesfred.optimize.peaks import beside
 from bayesfred.optimize.uncatalogued import COMMON, MOST_BESIDE, SHARP, SHARPEST
 
 BRIGHT = 10.0  # standard deviations of the noise: light that tells what the PSF leaves
@@ -45,17 +46,12 @@ def sharp_pixels(posterior: Posterior, params: Floats) -> Flags:
     middle = bright & (light == ndimage.maximum_filter(light, 3))
     if not middle.any():
         return np.zeros_like(mask)
-    sharpest = float(np.quantile(_beside(light)[middle] / light[middle], SHARPEST))
+    sharpest = float(np.quantile(beside(light)[middle] / light[middle], SHARPEST))
     share = min(SHARP * sharpest, MOST_BESIDE)
     common = float(np.quantile(np.abs(residual[bright]) / light[bright], COMMON)) / COMMON_SD
     own = np.abs(residual)
     least = SIGNIFICANCE * np.maximum(np.sqrt(variance), common * light)
-    missing = share * own - np.maximum(np.sign(residual) * _beside(residual), 0.0)
-    sd = np.sqrt(_beside(variance) + share**2 * variance)
+    missing = share * own - np.maximum(np.sign(residual) * beside(residual), 0.0)
+    sd = np.sqrt(beside(variance) + share**2 * variance)
     exceeds = own > np.maximum(least, SIGNIFICANCE**2)
     return np.asarray(mask & exceeds & (missing > SIGNIFICANCE * sd))
-
-
-def _beside(image: Floats) -> Floats:
-    """The sum of the eight pixels beside each."""
-    return np.asarray(9.0 * ndimage.uniform_filter(image, 3) - image)
