@@ -3,8 +3,9 @@ scipy's least squares."""
 
 import io
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -317,12 +318,39 @@ def test_undetermined_parameters_are_named() -> None:
     posterior = Posterior(model, simulate(model, np.zeros(12), 3.0, seed=34))
     with pytest.raises(InputError, match="the frame cannot determine") as caught:
         find_map(posterior)
-    named = str(caught.value).split("determine ")[1].split(", expected")[0].split(", ")
+    named = str(caught.value).split("determine ")[1].split(" by its 1 source, ")[0].split(", ")
     assert {"f_ux2", "g_uy2"} <= set(named) <= set(MIRRORED.names)
     # two terms that it can
     few = PolynomialDistortion([(1, 0, 2, 0)], [(0, 1, 2, 0)])
     model = ForwardModel(model.detector, model.sources, model.psf, few)
     assert find_map(Posterior(model, posterior.counts)).fits_data
+
+
+@pytest.mark.parametrize(
+    ("make", "sources", "degree"),
+    [
+        (PolynomialDistortion.polynomial, 9, 2),  # 10 terms of degree 3 a coordinate
+        (PolynomialDistortion.polynomial, 5, 1),
+        (partial(PolynomialDistortion.zernike, radius=50.0), 5, 1),
+    ],
+)
+def test_the_degree_that_the_sources_determine_is_named(
+    make: Callable[[int], PolynomialDistortion], sources: int, degree: int
+) -> None:
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-30.0, 30.0, (2, sources))
+    base = make_model(SourceCatalog(x, y, np.full(sources, 2e4)), tolerance=1e-8)
+
+    def frame_of(fitted: int) -> Posterior:
+        model = replace(base, distortion=make(fitted))
+        counts = simulate(model, np.zeros(model.distortion.n_terms), 3.0, seed=34)
+        return Posterior(model, counts, nuisances=Nuisances("free", offset=True))
+
+    with pytest.raises(InputError, match=f"degree above {degree} .*degree = {degree} in a run"):
+        find_map(frame_of(3))
+    find_map(frame_of(degree))
+    with pytest.raises(InputError, match="cannot determine"):
+        find_map(frame_of(degree + 1))
 
 
 @pytest.mark.parametrize("flux", ["fixed", "scale", "free"])

@@ -47,7 +47,7 @@ sigma = {sigma:.2g}  # pixels, a start: by the brightest peaks
 
 [distortion]
 terms = "polynomial"
-degree = 3
+degree = 3  # 9 terms a coordinate: 2 where there are fewer than some 12 sources
 
 [noise]
 {noise}

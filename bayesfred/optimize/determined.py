@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.model import priors
 from bayesfred.model.noise import PoissonNoise
@@ -33,25 +33,47 @@ def require_light(posterior: Posterior) -> None:
         )
 
 
-def undetermined(posterior: Posterior, params: Floats, fisher: Floats) -> tuple[str, ...]:
+def undetermined(
+    posterior: Posterior, params: Floats, fisher: Floats, fitted: Flags | None = None
+) -> tuple[str, ...]:
     """Parameters about which neither the frame nor a prior that was given says anything.
 
     With S the default priors' standard deviations, the eigenvalues of S I S compare, direction by
     direction, what is known with what the default priors know; I is the Fisher information,
     `fisher`, plus what the given priors know more than the default ones. The names are those that
-    make up the directions whose eigenvalue is below `LEAST_INFORMATION`.
+    make up the directions whose eigenvalue is below `LEAST_INFORMATION`. Parameters that are not
+    `fitted` are taken for known.
     """
     sd = np.array([p.prior.std() for p in posterior.parameters])
     given = np.array(
         [priors.slope(p, x)[1] for p, x in zip(posterior.prior.values(), params, strict=True)]
     )
     information = fisher + np.diag(np.maximum(given - sd**-2.0, 0.0))
+    if fitted is not None:
+        information = np.where(np.outer(fitted, fitted), information, np.diag(sd**-2.0))
     values, vectors = np.linalg.eigh(information * np.outer(sd, sd))
     lost = (values < LEAST_INFORMATION) & (_effect(posterior, sd, vectors) > LEAST_EFFECT)
     weak = (vectors[:, lost] ** 2).sum(axis=1) > 0.1
     return tuple(
         name for name, is_weak in zip(posterior.parameter_names, weak, strict=True) if is_weak
     )
+
+
+def determined_degree(posterior: Posterior, params: Floats, fisher: Floats) -> int | None:
+    """The highest degree up to which the frame determines all terms; None where it is none.
+
+    The Fisher information is as for `undetermined`.
+    """
+    d = posterior.model.polynomial
+    degrees = np.array([sum(term) for term in d.f_terms + d.g_terms])
+    if d.basis is not None:  # a combination of monomials has the highest degree of them
+        degrees = np.max(np.where(d.basis != 0.0, degrees[:, None], 0), axis=0)
+    fitted = np.ones(len(params), bool)
+    for degree in range(int(degrees.max()) - 1, 0, -1):
+        fitted[: d.n_terms] = degrees <= degree
+        if fitted[: d.n_terms].any() and not undetermined(posterior, params, fisher, fitted):
+            return degree
+    return None
 
 
 def _effect(posterior: Posterior, sd: Floats, vectors: Floats) -> Floats:

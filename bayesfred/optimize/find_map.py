@@ -15,7 +15,7 @@ from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.model.threads import one_blas_thread
-from bayesfred.optimize.determined import require_light, undetermined
+from bayesfred.optimize.determined import determined_degree, require_light, undetermined
 from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
 from bayesfred.optimize.joint_map import maximize_frames
@@ -228,10 +228,15 @@ def _search(
 
 def _require_determined(posterior: Posterior, params: Floats, fisher: Floats) -> None:
     if weak := undetermined(posterior, params, fisher):
+        degree = determined_degree(posterior, params, fisher)
+        fewer = "leave out terms"
+        if degree:
+            fewer += f" of a degree above {degree} (distortion.degree = {degree} in a run file)"
+        number = len(posterior.model.sources)
         raise InputError(
-            f"parameters: the frame cannot determine {', '.join(weak)}, expected each to move the "
-            "counts by more than their noise: leave out terms, add sources, or give these "
-            "parameters a narrower prior"
+            f"parameters: the frame cannot determine {', '.join(weak)} by its {number} "
+            f"source{'s' * (number != 1)}, expected each to move the counts by more than their "
+            f"noise: {fewer}, add sources, or give these parameters a narrower prior"
         )
 
 
