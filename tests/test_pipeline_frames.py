@@ -1,5 +1,6 @@
 """From a run file and a real frame to a posterior: what the frame says of itself is used."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,34 @@ def test_read_noise_of_the_header(
     assert said or not any("read noise" in note for note in notes)
     assert "gain 2 (GAIN)" in notes[0]
     np.testing.assert_allclose(np.median(posterior.counts), 50.0, atol=2.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "sigma", "said"),
+    [
+        ("measured", 0.5, True),
+        ("measured", 7.0, True),
+        ("measured", 1.2, False),  # near enough
+        ("gaussian", 0.5, False),  # not a start, but what the user says
+    ],
+)
+def test_a_far_off_start_of_a_psf_to_measure_is_not_used(
+    tmp_path: Path, kind: str, sigma: float, said: bool
+) -> None:
+    """From a quarter of the width no PSF is found, after minutes."""
+    run = write(tmp_path)
+    frame = tmp_path / "frame.fits"
+    with fits.open(frame) as hdus:
+        stored, header = np.array(hdus[0].data), hdus[0].header
+    stored[tuple(np.random.default_rng(2).integers(0, 120, (2, 40)))] += 3000.0  # hot pixels
+    fits.PrimaryHDU(stored, header).writeto(frame, overwrite=True)
+    run.write_text(run.read_text().replace("sigma = 2.0", f'kind = "{kind}"\nsigma = {sigma}'))
+    (tmp_path / "stars.csv").unlink()  # the start is known before
+    lines: list[str] = []
+    with pytest.raises(bf.InputError, match=r"stars\.csv"):
+        pipeline.read_frame(read_settings(run), run, lines.append)
+    found = re.findall(r"the brightest images, (\S+) pixels, which", "".join(lines))
+    assert len(found) == said and np.allclose(list(map(float, found)), 2.0, rtol=0.15), lines
 
 
 def test_free_fluxes_need_no_column(tmp_path: Path) -> None:

@@ -16,17 +16,21 @@ from bayesfred.commands.records import Result
 from bayesfred.commands.results import How, Job, Say, make_chain, write_results
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import outputs, paths
+from bayesfred.io.frames import FrameRecord
 from bayesfred.io.pixel_maps import read_mapped_frame
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
+from bayesfred.optimize.image_widths import image_widths
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
 
 __all__ = ["fit_frame", "read_frame"]
+
+ANOTHER = 2.0  # times the frame's own width: a start that is farther off is not used
 
 
 def read_frame(
@@ -74,6 +78,9 @@ def read_frame(
     note(frame.description, line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = psf or build.reference_psf(run, run_file)
+    if run.catalogue.grid is None or run.catalogue.grid.marks != "dots":
+        psf, line = _with_width(psf, frame)
+        note(line)
     with working("finding the sources", show=say is not None):
         sources, lines = find_sources(run, run_file, shape, psf, frame)
     note(*lines)
@@ -106,6 +113,22 @@ def read_frame(
             posterior = measured
             note(psf_message(posterior, estimate))
     return posterior, estimate, notes
+
+
+def _with_width(psf: PSF, frame: FrameRecord) -> tuple[PSF, str]:
+    """The PSF to measure, and a line where the frame's images are of quite another width.
+
+    Searches with a far narrower PSF find no images; they would end without a PSF after minutes.
+    """
+    if not isinstance(psf, PSFToMeasure):
+        return psf, ""
+    widths = image_widths(np.where(frame.valid, frame.counts, np.nan))
+    if widths is None or widths.low / ANOTHER < psf.sigma < widths.high * ANOTHER:
+        return psf, ""
+    return replace(psf, sigma=widths.typical), (
+        f"psf: sigma {psf.sigma:g} is not that of the brightest images, {widths.typical:.2g} "
+        "pixels, which is the start in its place"
+    )
 
 
 def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimate, list[str]]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage
 
 from bayesfred._typing import Floats, PathLike
 from bayesfred.analysis.photon_transfer import PhotonTransfer, photon_transfer
@@ -19,12 +18,10 @@ from bayesfred.io.frames import read_stored
 from bayesfred.io.headers import noise_in, units
 from bayesfred.io.paths import may_write
 from bayesfred.io.saturation import plateau
-from bayesfred.optimize.peaks import beside
+from bayesfred.optimize.image_widths import START, image_widths
 from bayesfred.settings.sections import toml_text
 
-STARS = 30  # peaks by which the PSF's width is measured
 FOOTPRINT, LEAST_FOOTPRINT = 4.5, 5.0  # widths that an image reaches, and pixels
-SHARP = 0.25  # of a peak's height beside it; an image of FWHM 1 has more, also in a pixel's middle
 KNOWN = 3.0  # standard deviations of a read noise that is worth a key
 
 TEXT = """\
@@ -124,7 +121,8 @@ def init(
     level = plateau(used[0][np.isfinite(used[0])])
     if level is not None:
         keys += f"saturation = {level!r}  # suspected: a plateau at the maximum\n"
-    sigma = _width(used[0])
+    widths = image_widths(used[0])
+    sigma = START if widths is None else widths.typical
     text = TEXT.format(
         name=printable(frame.name), path=toml_text(str(frame)), frame=keys, noise=noise,
         catalogue=toml_text(f"{stem}.csv"), sigma=sigma,
@@ -162,35 +160,3 @@ def _frame_keys(found: PhotonTransfer | None, message: str, image: StoredImage) 
         gain = f"# gain: none, as BUNIT is electrons; {found.gain:.5g} {errors}\n"
     pedestal = f"pedestal = {level:.6g}  # stored units, +- {level_sd:.2g}: {why}\n"
     return gain + pedestal, f"read_noise = {read_noise or 0.0:#.4g}  # e-, {by}\n"
-
-
-def _width(image: Floats) -> float:
-    """The width of the brightest peaks, pixels: of a Gaussian, F / 2 pi s^2 is the height.
-
-    Pixels beside which there is next to nothing are hot ones.
-    """
-    filled = np.where(np.isfinite(image), image, np.nanmedian(image))
-    filled = (
-        filled
-        - ndimage.median_filter(filled[::4, ::4], 9)
-        .repeat(4, 0)
-        .repeat(4, 1)[: image.shape[0], : image.shape[1]]
-    )
-    filled = np.where(beside(filled) < SHARP * filled, ndimage.median_filter(filled, 3), filled)
-    smooth = ndimage.gaussian_filter(filled, 1.0)
-    sigma = 1.5
-    for _ in range(3):
-        r = int(np.ceil(3.5 * sigma))
-        peak = smooth == ndimage.maximum_filter(smooth, 2 * r + 1)
-        peak[:r], peak[-r:], peak[:, :r], peak[:, -r:] = False, False, False, False
-        row, column = np.nonzero(peak)
-        brightest = np.argsort(-smooth[row, column])[:STARS]
-        cuts = [
-            filled[j - r : j + r + 1, i - r : i + r + 1]
-            for j, i in zip(row[brightest], column[brightest], strict=True)
-        ]
-        widths = [cut.sum() / (2.0 * np.pi * cut.max()) for cut in cuts if cut.max() > 0.0]
-        if not widths:
-            break
-        sigma = float(np.clip(np.sqrt(max(np.median(widths), 0.0)), 0.5, 20.0))
-    return sigma
