@@ -96,13 +96,13 @@ def test_a_frame_that_says_nothing_of_its_noise(
     assert read_settings(tmp_path / "a\"b\\'.toml").frame.path == "a\"b\\'.npy"
 
 
-def camera(folder: Path, fwhm: float) -> dict[str, float]:
+def camera(folder: Path, fwhm: float, n: int = 10, hot: int = 60) -> dict[str, float]:
     """A stranger's frame and catalogue in a folder; the coefficients of the lens that made it.
 
     Pinholes of unlike brightness, a background that is no plane, stars that the catalogue lacks,
     hot pixels, gain, read noise and pedestal.
     """
-    rng, size, n = np.random.default_rng(11), 320, 10
+    rng, size = np.random.default_rng(11), 320
     grid = (np.arange(n) - 0.5 * (n - 1)) * size / (n + 1)
     x, y = (each.ravel() for each in np.meshgrid(grid, grid))
     few = rng.uniform(-0.5 * size, 0.5 * size, (2, 20))
@@ -116,8 +116,8 @@ def camera(folder: Path, fwhm: float) -> dict[str, float]:
     light = bf.ForwardModel(detector, sources, psf, lens).expected_counts(theta)
     v, u = np.mgrid[:size, :size] / size - 0.5
     counts = rng.poisson(light + 150.0 + 40.0 * u - 30.0 * v**2).astype(float)
-    hot = rng.integers(0, size, (2, 60))
-    counts[hot[0], hot[1]] += 10.0 ** rng.uniform(2.0, 4.5, 60)
+    row, column = rng.integers(0, size, (2, hot))
+    counts[row, column] += 10.0 ** rng.uniform(2.0, 4.5, hot)
     stored = np.rint(counts / GAIN + rng.normal(0.0, NOISE / GAIN, counts.shape) + PEDESTAL)
     fits.PrimaryHDU(stored.clip(0, 65535).astype(np.uint16)).writeto(folder / "camera.fits")
     np.savetxt(folder / "camera.csv", np.c_[x, y], delimiter=",", header="x,y", comments="")
@@ -161,3 +161,22 @@ def test_what_is_proposed_fits_a_strangers_frame(
     Path("gaussian.toml").write_text(text)
     done = CliRunner().invoke(app, ["fit", "gaussian.toml", "--map-only"])
     assert done.exit_code == 3 and "does not fit the counts" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_frame_without_footprints_is_matched_among_hot_pixels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The brightest peaks are hot pixels, which the search matched to the catalogue."""
+    monkeypatch.chdir(tmp_path)
+    truth = camera(tmp_path, 3.0, n=5, hot=300)
+    assert invoke("camera.fits")[0] == 0
+    text = Path("camera.toml").read_text()
+    Path("camera.toml").write_text(re.sub("footprint = .*", "", text))
+    done = CliRunner().invoke(app, ["fit", "camera.toml", "--map-only"])
+    chain = bf.open_chain("chains/camera.h5")
+    draws = chain.draws()[:, [chain.parameter_names.index(name) for name in truth]]
+    off = draws.mean(axis=0) - list(truth.values())
+    assert off @ np.linalg.solve(np.cov(draws.T), off) < 49.0
+    number = re.search(r"hot pixels or cosmic rays: (\d+) pixels at row, column", done.stdout)
+    assert number is not None and 220 <= int(number[1]) <= 300

@@ -18,10 +18,12 @@ from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import outputs, paths
 from bayesfred.io.frames import FrameRecord
 from bayesfred.io.pixel_maps import read_mapped_frame
+from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
+from bayesfred.optimize.hot_pixels import hot_pixels, pixels_named
 from bayesfred.optimize.image_widths import image_widths
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.uncatalogued import find_uncatalogued
@@ -78,9 +80,8 @@ def read_frame(
     note(frame.description, line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = psf or build.reference_psf(run, run_file)
-    if run.catalogue.grid is None or run.catalogue.grid.marks != "dots":
-        psf, line = _with_width(psf, frame)
-        note(line)
+    psf, frame, lines = _by_its_peaks(run, psf, frame, noise)
+    note(*lines)
     with working("finding the sources", show=say is not None):
         sources, lines = find_sources(run, run_file, shape, psf, frame)
     note(*lines)
@@ -108,27 +109,36 @@ def read_frame(
         if has_pixel(posterior.model.psf) or rough:
             with working("measuring the PSF", show=say is not None):
                 measured, estimate = _with_measured_psf(posterior, estimate, psf, run)
-            if n := int(np.sum(posterior.mask & ~measured.mask)):
-                note(f"{n} pixel{'s' * (n > 1)} within images, sharper than the PSF: masked")
+            sharp = posterior.mask & ~measured.mask
+            note(f"sharper than the PSF: {pixels_named(sharp)}, masked" if sharp.any() else "")
             posterior = measured
             note(psf_message(posterior, estimate))
     return posterior, estimate, notes
 
 
-def _with_width(psf: PSF, frame: FrameRecord) -> tuple[PSF, str]:
-    """The PSF to measure, and a line where the frame's images are of quite another width.
+def _by_its_peaks(
+    run: settings.RunSettings, psf: PSF, frame: FrameRecord, noise: Noise
+) -> tuple[PSF, FrameRecord, list[str]]:
+    """The PSF to measure with about the width of the frame's images, and no pixels that are hot.
 
-    Searches with a far narrower PSF find no images; they would end without a PSF after minutes.
+    Searches with a far narrower PSF find no images, and a search among many hot pixels others.
     """
-    if not isinstance(psf, PSFToMeasure):
-        return psf, ""
-    widths = image_widths(np.where(frame.valid, frame.counts, np.nan))
-    if widths is None or widths.low / ANOTHER < psf.sigma < widths.high * ANOTHER:
-        return psf, ""
-    return replace(psf, sigma=widths.typical), (
-        f"psf: sigma {psf.sigma:g} is not that of the brightest images, {widths.typical:.2g} "
-        "pixels, which is the start in its place"
-    )
+    lines: list[str] = []
+    if run.catalogue.grid is not None and run.catalogue.grid.marks == "dots":
+        return psf, frame, lines
+    if run.frame.reject_outliers:
+        hot = hot_pixels(frame.counts, frame.valid, noise)
+        frame = replace(frame, valid=frame.valid & ~hot)
+        lines += [f"hot pixels or cosmic rays: {pixels_named(hot)}, masked"] if hot.any() else []
+    if isinstance(psf, PSFToMeasure):
+        widths = image_widths(np.where(frame.valid, frame.counts, np.nan))
+        if widths and not widths.low / ANOTHER < psf.sigma < widths.high * ANOTHER:
+            lines.append(
+                f"psf: sigma {psf.sigma:g} is not that of the brightest images, "
+                f"{widths.typical:.2g} pixels, which is the start in its place"
+            )
+            psf = replace(psf, sigma=widths.typical)
+    return psf, frame, lines
 
 
 def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimate, list[str]]:

@@ -72,7 +72,7 @@ def image_widths(image: Floats) -> ImageWidths | None:
         squares = [cut.sum() / (2.0 * np.pi * cut.max()) for cut in cuts if cut.max() > 0.0]
         if not squares:
             break
-        widths = np.sqrt(np.maximum(np.quantile(squares, [0.25, 0.5, 0.75]), 0.0))
-        found = ImageWidths(*np.clip(widths, NARROWEST, WIDEST).tolist())
+        quartiles = np.sqrt(np.maximum(np.quantile(squares, [0.25, 0.5, 0.75]), 0.0))
+        found = ImageWidths(*np.clip(quartiles, NARROWEST, WIDEST).tolist())
         sigma = found.typical
     return found

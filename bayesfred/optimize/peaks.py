@@ -168,3 +168,13 @@ def vertex(image: Floats, row: Ints, column: Ints) -> Floats:
 def beside(image: Floats) -> Floats:
     """The sum of the eight pixels beside each, shape (ny, nx)."""
     return np.asarray(9.0 * ndimage.uniform_filter(image, 3) - image)
+
+
+def above_ring(image: Floats) -> tuple[Floats, Floats, Floats]:
+    """What a pixel holds, and the eight beside it, above the mean of the 16 around these; the mean.
+
+    Each has the image's shape.
+    """
+    nine = 9.0 * ndimage.uniform_filter(image, 3)
+    level = (25.0 * ndimage.uniform_filter(image, 5) - nine) / 16.0
+    return image - level, nine - image - 8.0 * level, level

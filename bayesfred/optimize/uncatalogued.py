@@ -32,7 +32,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.outliers import FAINT, SIGNIFICANCE
-from bayesfred.optimize.peaks import vertex
+from bayesfred.optimize.peaks import above_ring, vertex
 
 COMMON = 0.75  # quantile of the bright stars' shares that is the PSF's
 MISFIT = 2.5  # times that
@@ -181,10 +181,7 @@ class _Filtered:
         whole = ndimage.minimum_filter(valid, 5, mode="constant", cval=False)
         # not the residual, which a wrong PSF makes sharp; above the 16 pixels farther out, so that
         # no background is needed, and their share of the variance
-        counts = np.where(valid, self.posterior.counts, 0.0)
-        nine = 9.0 * ndimage.uniform_filter(counts, 3)
-        level = (25.0 * ndimage.uniform_filter(counts, 5) - nine) / 16.0
-        own, beside = counts - level, nine - counts - 8.0 * level
+        own, beside, _ = above_ring(np.where(valid, self.posterior.counts, 0.0))
         at = tuple(np.rint(self.images[stars]).astype(int).T)
         usable = whole[at] & (own[at] > 0.0)
         if usable.sum() < FEWEST:

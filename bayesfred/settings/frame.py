@@ -41,8 +41,8 @@ class FrameSettings(Section):
     variance : str, optional, e-^2
         The file of a map of the read-out's variance, whose root is the read noise.
     reject_outliers : bool
-        Whether unmatched sources and spurious detections are left out:
-        `bayesfred.reject_outliers`.
+        Whether unmatched sources and spurious detections are left out, see
+        `bayesfred.reject_outliers`, and hot pixels before anything is searched for.
     """
 
     path: Name
