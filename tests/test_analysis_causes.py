@@ -1,5 +1,6 @@
 """Causes of a misfit: planted faults are named first, a true model has none, the sums are right."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from bayesfred.analysis.causes.cause import Finding
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.find import ranked
 from bayesfred.analysis.causes.pixels import full_pixels
+from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.residuals import judge_residuals
 from bayesfred.analysis.verdict import judge_fit
 from bayesfred.imaging.catalog import SourceCatalog
@@ -23,6 +25,8 @@ from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.fit_statistics import fit_statistics
+from bayesfred.sampling.laplace import laplace
+from bayesfred.sampling.record import RunRecord
 
 FRAMES = 50
 
@@ -81,6 +85,18 @@ def test_leaving_out_outliers_cures_companions() -> None:
         inverse = np.linalg.inv(estimate.covariance[:4, :4])
         assert (off @ inverse @ off < stats.chi2(4).isf(1e-4)) == is_cured
     assert kept.mask.sum() < posterior.mask.sum()
+
+
+@pytest.mark.parametrize("name", ["companions", "uncatalogued sources", "wrong sources"])
+def test_no_remedy_is_one_that_the_run_file_has(name: str) -> None:
+    plant = next(make for make, right in planted.FAULTS.values() if right[0] == name)
+    chain = laplace(plant(101), seed=1)
+    for value, expected in (("false", True), ("true", False)):
+        record = RunRecord(settings=f"[frame]\nreject_outliers = {value}\n")
+        verdict = diagnose(replace(chain, record=record))
+        assert verdict.causes[0].name == name
+        assert ("reject_outliers" in verdict.message) == expected
+        assert verdict.causes[0].remedy
 
 
 def test_a_true_model_has_no_cause() -> None:

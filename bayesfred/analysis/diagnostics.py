@@ -286,7 +286,9 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         if isinstance(posterior, Posterior):
             residuals = judge_residuals(posterior, best.params, best.covariance)
             checks += residuals.checks
-        fitted = judge_fit(posterior, best, fit, residuals)
+        settings = (chain.record and chain.record.settings) or ""
+        rejected = "reject_outliers = true" in settings.splitlines()
+        fitted = judge_fit(posterior, best, fit, residuals, rejected=rejected)
     rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
     acceptance = efficiency = np.nan
     sampled_well = None

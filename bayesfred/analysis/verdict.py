@@ -62,7 +62,12 @@ class FitVerdict:
 
 
 def judge_fit(
-    posterior: Any, estimate: MapEstimate, fit: Mapping[str, float], residuals: Residuals | None
+    posterior: Any,
+    estimate: MapEstimate,
+    fit: Mapping[str, float],
+    residuals: Residuals | None,
+    *,
+    rejected: bool = False,
 ) -> FitVerdict:
     """Judge whether a model fits the counts at its maximum.
 
@@ -79,6 +84,8 @@ def judge_fit(
         See `fit_statistics`.
     residuals : Residuals or None
         See `judge_residuals`. None for another density with counts: only the sums are judged.
+    rejected : bool
+        Whether outliers were rejected already, so that this is no remedy.
 
     Returns
     -------
@@ -93,7 +100,7 @@ def judge_fit(
             consist, unmatched = False, matched.removeprefix(", ")
         failures = _failures(residuals)
         if not consist:
-            causes = find_causes(posterior, params)
+            causes = find_causes(posterior, params, rejected=rejected)
         causes = causes or hidden_causes(posterior, residuals.scores, residuals.tests)
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))

@@ -39,6 +39,9 @@ NO_DENSITY = (
     "does not fold"
 )
 
+# What the message of a search suggests that has not rejected them.
+OUTLIERS = ", unmatched sources or spurious detections (reject_outliers leaves them out)"
+
 MOSTLY_REJECTED = (
     "but over 40 % of the sources in the frame were rejected, so that what remains may fit with "
     "wrong parameters: check the catalogue, or narrow the priors"
@@ -349,9 +352,7 @@ def _advice(fit: Mapping[str, float], enough: bool, rejecting: bool) -> str:
             "catalogue's columns, unit and origin"
         )
     if not excess < 0:
-        outliers = "" if rejecting else (
-            ", unmatched sources or spurious detections (reject_outliers leaves them out)"
-        )  # fmt: skip
+        outliers = "" if rejecting else OUTLIERS
         return (
             f"but the residuals exceed the noise ({said} {excess:.0f} standard deviations above "
             f"its expectation): look at them for a wrong PSF, wrong fluxes, missing terms{outliers}"

@@ -12,7 +12,7 @@ from bayesfred.imaging.psf import FWHM, MeasuredPSF
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import OccamFactor, PsfErrors
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.psf_marginal import occam_factor, shared_information
@@ -88,7 +88,10 @@ def measure_psf(
         slopes = _gradients(bare, psf, top.params)
     occam = occam_factor(bare, state, top.params) if bare.nuisances.model_error else None
     measured = _marginalized(bare, slopes, top.params, psf.determined, occam)
-    return measured, find_map(measured, top.params)
+    found = find_map(measured, top.params)
+    if reject_outliers:
+        found = replace(found, message=found.message.replace(OUTLIERS, ""))
+    return measured, found
 
 
 def _near(

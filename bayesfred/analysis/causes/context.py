@@ -44,11 +44,14 @@ class Context:
     params : ndarray, shape (d,)
     left_out : ndarray of bool, shape (ny, nx)
         Pixels that an earlier cause has explained.
+    rejected : bool
+        Whether outliers were rejected already.
     """
 
     posterior: Posterior
     params: Floats
     left_out: Flags
+    rejected: bool = False
 
     @cached_property
     def light(self) -> SourceLight:

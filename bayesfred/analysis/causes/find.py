@@ -16,7 +16,9 @@ NOTICEABLE = 5.0  # standard deviations of a misfit
 LEAST = 0.05  # share of the misfit below which a cause is not named
 
 
-def find_causes(posterior: Posterior, params: Floats) -> tuple[Cause, ...]:
+def find_causes(
+    posterior: Posterior, params: Floats, *, rejected: bool = False
+) -> tuple[Cause, ...]:
     """Look for the reasons why a model does not fit the counts.
 
     Parameters
@@ -25,6 +27,8 @@ def find_causes(posterior: Posterior, params: Floats) -> tuple[Cause, ...]:
     params : ndarray, shape (d,)
         The maximum. The model is taken not to fit there: of one that fits, this is to be called
         only if hardly a source is matched.
+    rejected : bool
+        Whether outliers were rejected already, so that this is no remedy.
 
     Returns
     -------
@@ -43,13 +47,13 @@ def find_causes(posterior: Posterior, params: Floats) -> tuple[Cause, ...]:
     'gain'
     """
     none = np.zeros(posterior.counts.shape, bool)
-    context = Context(posterior, params, none)
+    context = Context(posterior, params, none, rejected)
     total = abs(context.excess)
     findings: list[Finding | None] = []
     saturated, spoiled = saturation(context)
     findings.append(saturated)
     if saturated is not None:
-        context = Context(posterior, params, spoiled)
+        context = Context(posterior, params, spoiled, rejected)
     if not context.light.matched.any() and abs(context.excess) < NOTICEABLE * context.spread:
         return (replace(unmatched(context).cause, share=1.0),)
     if context.light.matched.any() or context.bright.any():

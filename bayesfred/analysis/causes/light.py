@@ -20,6 +20,7 @@ FEW = 0.2  # of the sources: more than these are not the ones to blame
 OUTLYING = 6.0  # times the typical misfit of a source as bright
 NOTICEABLE = 6.0  # standard deviations
 NAMED = 5  # sources listed
+REJECT = "set frame.reject_outliers = true"
 ORDERS = range(5)  # of the pattern that is no companion, coma and trefoil included
 
 
@@ -69,13 +70,14 @@ def single_sources(context: Context) -> Iterator[Finding]:
         order = np.argsort(-own)[: min(NAMED, int(wrong.sum()))]
         s = context.posterior.model.sources
         names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in order)
+        leave_out = "leave them out" if context.rejected else REJECT
         dim = f", {dark.sum()} of them with no light at their image" if dark.any() else ""
         more = ", ..." if wrong.sum() > len(order) else ""
         cause = Cause(
             "wrong sources", 0.0,
             f"{wrong.sum()} of {light.inside.sum()} sources hold the misfit{dim}: rows of the "
             f"catalogue, from 0: {names}{more}",
-            "correct their positions and fluxes, or set frame.reject_outliers = true",
+            f"correct their positions and fluxes, or {leave_out}",
         )  # fmt: skip
         explained = float(own.sum() + found.power[near].sum())
         yield Finding(cause, explained, "position")
@@ -86,7 +88,8 @@ def single_sources(context: Context) -> Iterator[Finding]:
             "uncatalogued sources", 0.0,
             f"{rest.size} detections belong to no source of the catalogue, the brightest at "
             f"u, v = {at}",
-            "set frame.reject_outliers = true, or footprint, or complete the catalogue",
+            "complete the catalogue" if context.rejected
+            else f"{REJECT}, or footprint, or complete the catalogue",
         )  # fmt: skip
         yield Finding(cause, float(rest.sum()), "position")
 
@@ -160,7 +163,7 @@ def companions(context: Context) -> Finding | None:
         "catalogued source, which differs from source to source, as that of a wrong PSF would "
         f"not: the most at {np.hypot(found.u[pixel], found.v[pixel]):.1f} pixels from row {first} "
         f"of the catalogue, from 0, at x, y = {catalog.x[first]:.1f}, {catalog.y[first]:.1f}",
-        "set frame.reject_outliers = true, which leaves out the sources concerned, or complete the "
-        "catalogue",
+        "complete the catalogue" if context.rejected
+        else f"{REJECT}, which leaves out the sources concerned, or complete the catalogue",
     )  # fmt: skip
     return Finding(cause, float(best[some].sum()), "light position", RICHER)
