@@ -264,6 +264,17 @@ def test_where_nothing_can_be_redrawn_a_line_comes_every_half_minute(terminal: b
 
 
 @pytest.mark.parametrize("terminal", [False, True])
+def test_no_share_is_told_while_none_is_known(terminal: bool) -> None:
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=terminal, force_jupyter=False, _environ={})
+    with progress_bar("sampling", console=console, clock=Clock()) as update:
+        for n in range(1, 6):
+            update(n, None, f"{n} steps")
+    text = stream.getvalue()
+    assert "5 steps" in text if terminal else re.fullmatch(r"(sampling: \d steps\n)+", text)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
 @pytest.mark.parametrize("show", [False, True])
 def test_long_work_is_never_silent(terminal: bool, show: bool) -> None:
     """Negative control: where nothing is to be shown there is nothing."""

@@ -41,7 +41,7 @@ from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.datatree import source_of_pixels
 from bayesfred.sampling.ensembles import DE_SHARE, adapted, moves_after
 from bayesfred.sampling.sampler import Run, sample
-from bayesfred.sampling.stopping import checks, forgetting
+from bayesfred.sampling.stopping import checks, forgetting, sufficient
 
 Floats = NDArray[np.float64]
 
@@ -943,6 +943,15 @@ def test_the_posterior_is_rebuilt(
         nuisances,
     )
     assert fingerprint(again) == fingerprint(posterior)
+
+
+def test_no_share_of_a_run_is_told_from_the_number_of_draws() -> None:
+    """They are no effective draws: 88 % after 7 steps came before 12 % after 8."""
+    steps = np.random.default_rng(1).standard_normal((4, 40, 32, 2)).cumsum(axis=1)
+    assert sufficient(steps[:, :7], 1000.0) == (False, 0.0)
+    enough, share = sufficient(steps, 1000.0)
+    assert not enough and 0.0 < share < 0.9
+    assert sufficient(np.diff(steps, axis=1), 1000.0)[1] > 1.0
 
 
 @pytest.mark.parametrize("effective", [0.0, 1e-15, 1e-3])

@@ -78,7 +78,7 @@ def progress_bar(
     show: bool = True,
     console: Console | None = None,
     clock: Callable[[], float] = time.monotonic,
-) -> Iterator[Callable[[float, float, str], None]]:
+) -> Iterator[Callable[[float, float | None, str], None]]:
     """A function that is told how much is done, how much there is to do, and the state in words.
 
     Parameters
@@ -95,7 +95,7 @@ def progress_bar(
     Yields
     ------
     callable
-        Takes what is done, the total, and the state.
+        Takes what is done, the total, None while it is not known, and the state.
 
     Examples
     --------
@@ -112,13 +112,13 @@ def progress_bar(
     with bar:
         task = bar.add_task("", total=None, state="")
 
-        def update(done: float, total: float, state: str) -> None:
+        def update(done: float, total: float | None, state: str) -> None:
             nonlocal told
             if live:
                 bar.update(task, completed=done, total=total, state=state)
             elif show and clock() - told >= INTERVAL:
                 told = clock()
-                line = f"{label}: {state}, {done / total:.0%}"
+                line = f"{label}: {state}" + (f", {done / total:.0%}" if total else "")
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
 
         yield update

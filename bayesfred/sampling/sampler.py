@@ -320,8 +320,8 @@ class Run:
             with progress_bar("sampling", show=show) as update:
                 for share in self._advance(target_ess, steps):
                     n = len(self.steps)
-                    total = steps or max(n + 1, math.ceil(n / max(share, 0.05)))
-                    update(n, total, f"{n} steps")
+                    total = max(n + 1, math.ceil(n / share)) if share > 0.0 else None
+                    update(n, steps or total, f"{n} steps")
                     if checkpoints.due():
                         checkpoints.save(self._chain(target_ess))
             chain = self._chain(target_ess)

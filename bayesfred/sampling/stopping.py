@@ -50,7 +50,7 @@ def sufficient(chain: Floats, target_ess: float) -> tuple[bool, float]:
     """Whether the draws suffice, and the share of the effective draws wanted that there are.
 
     They suffice where every parameter's bulk and tail effective sample sizes reach the target and
-    its R-hat is at most 1.01.
+    its R-hat is at most 1.01. The share is 0 while it cannot be known.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def sufficient(chain: Floats, target_ess: float) -> tuple[bool, float]:
     kept = chain[:, burn_in(chain) :]
     draws = kept[..., 0].size
     if draws < target_ess:  # there are no more effective draws than draws
-        return False, draws / target_ess
+        return False, 0.0
     share = float(np.min(effective_sizes(kept)) / target_ess)
     return bool(share >= 1.0 and rhats(kept).max() <= RHAT), share
 
