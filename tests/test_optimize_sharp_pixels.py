@@ -7,6 +7,7 @@ import pytest
 
 import bayesfred as bf
 from bayesfred._typing import Flags
+from bayesfred.optimize.find_map import approach
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
@@ -57,6 +58,33 @@ def test_planted_pixels_are_found_and_nothing_else(fwhm: float) -> None:
             others[kind] += int(sharp[~changed].sum())
     assert found["hot"] >= 28 and found["dead"] >= 18, found
     assert max(others.values()) <= 1, others
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["companions", "nothing"])
+def test_what_a_measured_psf_does_not_explain_is_left_out(kind: str) -> None:
+    """Companions of six stars, which searches with a rough PSF have to tolerate.
+
+    Chi-square of the distortion, two coefficients, exceeds 18.4 for one in 10,000.
+    """
+    posterior, _ = posterior_of(2.0, np.random.default_rng(2), kind)
+    rough = replace(
+        posterior.with_psf(bf.GaussianPSF(0.9)),
+        nuisances=replace(posterior.nuisances, psf_sigma=True),
+    )
+    kept, estimate = approach(rough, rejecting=True)
+    left, errors = {}, {}
+    for reject in (False, True):
+        measured, top = bf.measure_psf(kept, estimate, model_error=True, reject_outliers=reject)
+        left[reject] = measured.mask
+        errors[reject] = top.params[measured.parameter_names.index("model_error")]
+        off, covariance = top.params[:2], top.covariance[:2, :2]
+        assert off @ np.linalg.solve(covariance, off) < 18.4
+    if kind == "nothing":
+        np.testing.assert_array_equal(left[True], left[False])
+    else:
+        assert errors[False] > 0.1 and errors[True] < 0.02
+        assert 0 < np.sum(left[False] & ~left[True]) < 0.1 * kept.mask.sum()
 
 
 @pytest.mark.slow

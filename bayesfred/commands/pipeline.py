@@ -109,8 +109,9 @@ def read_frame(
         if has_pixel(posterior.model.psf) or rough:
             with working("measuring the PSF", show=say is not None):
                 measured, estimate = _with_measured_psf(posterior, estimate, psf, run)
-            sharp = posterior.mask & ~measured.mask
-            note(f"sharper than the PSF: {pixels_named(sharp)}, masked" if sharp.any() else "")
+            lost = posterior.mask & ~measured.mask
+            line = f"not explained by the PSF: {pixels_named(lost)}, masked"
+            note(line if lost.any() else "")
             posterior = measured
             note(psf_message(posterior, estimate))
     return posterior, estimate, notes

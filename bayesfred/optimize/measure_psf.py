@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import FWHM, MeasuredPSF
 from bayesfred.model.posterior import Posterior
@@ -15,9 +15,12 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import NewtonResult, maximize
+from bayesfred.optimize.outliers import reject_once
 from bayesfred.optimize.psf_marginal import occam_factor, shared_information
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
+ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
+FEW = 0.05  # of the sources, which may be lost so
 LARGEST_ERROR = 0.1  # where the search for a model error begins: with more, misfits grow
 
 
@@ -47,7 +50,8 @@ def measure_psf(
         Where this has one of the model error.
     reject_outliers : bool
         Mask single pixels within images that are sharper than the PSF, hot or dead ones and cosmic
-        rays, and measure it without them.
+        rays, and where a model error is fitted what else the PSF does not explain of a few sources;
+        and measure it without them.
 
     Returns
     -------
@@ -78,8 +82,11 @@ def measure_psf(
     given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
     psf, state, drawn = find_psf(posterior, estimate, oversampling, degree)
     bare, top = _near(posterior, estimate, psf, model_error, given)
-    if reject_outliers and np.any(sharp := sharp_pixels(bare, top.params)):
-        posterior = replace(posterior, mask=posterior.mask & ~sharp, extrapolation=None)
+    for _ in range(ROUNDS if reject_outliers else 0):
+        kept = _explained(bare, top.params)
+        if np.array_equal(kept, posterior.mask):
+            break
+        posterior = replace(posterior, mask=kept, extrapolation=None)
         psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, state)
         bare, top = _near(posterior, estimate, psf, model_error, given)
     if bare.model.optics().translates:
@@ -92,6 +99,19 @@ def measure_psf(
     if reject_outliers:
         found = replace(found, message=found.message.replace(OUTLIERS, ""))
     return measured, found
+
+
+def _explained(posterior: Posterior, params: Floats) -> Flags:
+    """The pixels without those that a measured PSF does not explain.
+
+    Where no model error tells what the PSF leaves of the sources, these are single pixels alone,
+    and so they are where many sources would be lost: then it is the model that does not fit.
+    """
+    kept = posterior.mask & ~sharp_pixels(posterior, params)
+    if not posterior.nuisances.model_error:
+        return kept
+    found = reject_once(replace(posterior, mask=kept, extrapolation=None), params)
+    return found.posterior.mask if found.share <= FEW else kept
 
 
 def _near(
