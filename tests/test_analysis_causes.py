@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesfred.analysis.causes import Cause, find_causes
-from bayesfred.analysis.causes.cause import Finding
+from bayesfred.analysis.causes.cause import Finding, psf_remedy, scatter_remedy
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.find import ranked
 from bayesfred.analysis.causes.pixels import full_pixels
@@ -19,7 +19,7 @@ from bayesfred.analysis.verdict import judge_fit
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.psf import GaussianPSF
+from bayesfred.imaging.psf import GaussianPSF, MeasuredPSF
 from bayesfred.model.noise import BackgroundNoise, GaussianNoise, PoissonNoise, simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
@@ -97,6 +97,18 @@ def test_no_remedy_is_one_that_the_run_file_has(name: str) -> None:
         assert verdict.causes[0].name == name
         assert ("reject_outliers" in verdict.message) == expected
         assert verdict.causes[0].remedy
+
+
+def test_remedies_are_those_that_a_run_can_take() -> None:
+    """Of positions that scatter with free fluxes, and of a PSF that was measured."""
+    posterior = planted.true(1, flux="free")
+    assert scatter_remedy(posterior) == "set nuisances.position_scatter = true"
+    assert scatter_remedy(planted.true(1)).startswith('set nuisances.flux = "free" and ')
+    assert psf_remedy(posterior, "another") == "another"
+    coefficients = np.zeros((6, 9, 9))  # of degree 2
+    coefficients[0, 3:6, 3:6] = 4.0 / 9.0
+    measured = posterior.with_psf(MeasuredPSF(coefficients, 2.0, 80.0))
+    assert "psf.degree = 4" in psf_remedy(measured, "another")
 
 
 def test_a_true_model_has_no_cause() -> None:

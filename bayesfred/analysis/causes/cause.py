@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+from bayesfred.imaging.psf import MeasuredPSF
+from bayesfred.model.posterior import Posterior
+
 RICHER = 0.9  # weight of a hypothesis that contains others
 
 
@@ -53,3 +56,17 @@ class Finding:
     def shares(self, other: "Finding") -> bool:
         """Whether both explain the same squares."""
         return not set(self.family.split()).isdisjoint(other.family.split())
+
+
+def scatter_remedy(posterior: Posterior) -> str:
+    """What lets sources lie off their places."""
+    fluxes = "" if posterior.nuisances.flux == "free" else 'nuisances.flux = "free" and '
+    return f"set {fluxes}nuisances.position_scatter = true"
+
+
+def psf_remedy(posterior: Posterior, other: str) -> str:
+    """What to do about a wrong PSF: of a measured one, and of any other."""
+    psf = posterior.model.psf
+    if not isinstance(psf, MeasuredPSF):
+        return other
+    return f"let the PSF vary more over the field (psf.degree = {psf.degree + 2})"

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
-from bayesfred.analysis.causes.cause import RICHER, Cause, Finding
+from bayesfred.analysis.causes.cause import RICHER, Cause, Finding, psf_remedy
 from bayesfred.analysis.causes.common import REACH, RINGS, common_pattern
 from bayesfred.analysis.causes.context import BRIGHT, DETECTED, Context
 
@@ -120,8 +120,11 @@ def _shape(context: Context, explained: float, profile: Floats) -> Finding | Non
         "PSF", 0.0,
         f"around the sources the counts have {side} light than the PSF, by "
         f"{abs(profile[worst]) / peak:.2%} of its peak at {ring:.1f} pixels{also}",
-        f'fit another PSF: kind = "moffat" or "sampled"{box}' if mode
-        else "set nuisances.psf_sigma = true, or fit another PSF",
+        psf_remedy(
+            context.posterior,
+            f'fit another PSF: kind = "moffat" or "sampled"{box}' if mode
+            else "set nuisances.psf_sigma = true, or fit another PSF",
+        ),
     )  # fmt: skip
     return Finding(cause, explained, "light", RICHER)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.analysis.causes.cause import RICHER, Cause, Finding
+from bayesfred.analysis.causes.cause import RICHER, Cause, Finding, scatter_remedy
 from bayesfred.analysis.causes.context import BRIGHT, Context
 from bayesfred.analysis.causes.search import Placement, find_placement
 from bayesfred.optimize.matching import Field
@@ -79,7 +79,7 @@ def scatter(context: Context) -> Finding | None:
     cause = Cause(
         "positions", 0.0,
         f"the sources lie off their places, by {size:.2g} pixels along each axis (68 % of them)",
-        'set nuisances.flux = "free" and nuisances.position_scatter = true',
+        scatter_remedy(context.posterior),
     )  # fmt: skip
     return Finding(cause, explained, "light position", RICHER) if explained > 0.0 else None
 

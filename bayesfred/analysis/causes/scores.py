@@ -8,7 +8,7 @@ squares. Numbers in the model explain the squares of their scores, one beside th
 import numpy as np
 
 from bayesfred._typing import Ints
-from bayesfred.analysis.causes.cause import RICHER, Cause, Finding
+from bayesfred.analysis.causes.cause import RICHER, Cause, Finding, psf_remedy, scatter_remedy
 from bayesfred.analysis.causes.find import ranked
 from bayesfred.analysis.causes.light import FEW, NAMED
 from bayesfred.analysis.score_tests import Lead, ScoreTests
@@ -29,17 +29,15 @@ REMEDIES = {
     "f_": MORE_TERMS,
     "g_": MORE_TERMS,
 }
-# Which columns of the sources' deviates, what is found, and what to do.
+# Which columns of the sources' deviates, and what is found.
 SPREADS = {
     "fluxes": (
         "light",
         "the sources have other fluxes than the catalogue's, by some {:.1%} each",
-        'set nuisances.flux = "free"',
     ),
     "positions": (
         "position",
         "the sources lie off their places, by some {:.2g} pixels along each axis",
-        'set nuisances.flux = "free" and nuisances.position_scatter = true',
     ),
 }
 
@@ -62,7 +60,9 @@ def hidden_causes(
     """
     squares = np.where(np.isfinite(tests.z), tests.z**2 - 1.0, 0.0)
     own = np.sum(squares[:, 1:], axis=1)
-    findings = [_numbers(name, leads) for name, leads in _by_remedy(scores.leading).items()]
+    findings = [
+        _numbers(posterior, name, leads) for name, leads in _by_remedy(scores.leading).items()
+    ]
     failed = np.flatnonzero(tests.failed)
     few = failed.size <= max(2, FEW * own.size)
     if failed.size and few:
@@ -72,11 +72,14 @@ def hidden_causes(
     elif failed.size:
         profile = float(squares[:, [0, *KINDS["size and shape"]]].sum())
         text = f"{failed.size} of {own.size} sources do not look like the PSF"
-        findings.append(Finding(Cause("PSF", 0.0, text, "fit another PSF"), profile, "PSF", RICHER))
+        cause = Cause("PSF", 0.0, text, psf_remedy(posterior, "fit another PSF"))
+        findings.append(Finding(cause, profile, "PSF", RICHER))
     others = squares[~tests.failed] if few else squares
     for spread in tests.failed_spreads:
-        kind, text, remedy = SPREADS[spread.name]
-        pixel = posterior.model.detector.binning if spread.name == "positions" else 1.0
+        kind, text = SPREADS[spread.name]
+        remedy, pixel = 'set nuisances.flux = "free"', 1.0
+        if spread.name == "positions":
+            remedy, pixel = scatter_remedy(posterior), posterior.model.detector.binning
         cause = Cause(spread.name, 0.0, text.format(spread.estimate / pixel), remedy)
         some = others[:, KINDS[kind]]
         explained = float(some.sum()) - NOISE * (2.0 * some.size) ** 0.5
@@ -94,9 +97,11 @@ def _by_remedy(leading: tuple[Lead, ...]) -> dict[tuple[str, str], list[Lead]]:
     return groups
 
 
-def _numbers(which: tuple[str, str], leads: list[Lead]) -> Finding:
+def _numbers(posterior: Posterior, which: tuple[str, str], leads: list[Lead]) -> Finding:
     """Numbers that are wrong."""
     (name, remedy), first = which, leads[0]
+    if name == "PSF":
+        remedy = psf_remedy(posterior, remedy)
     text = (
         f"{first.name} is {abs(first.z):.0f} standard deviations from zero score: the counts ask "
         f"for {first.value + first.step:.4g} in place of {first.value:.4g}"
