@@ -353,6 +353,18 @@ def test_the_degree_that_the_sources_determine_is_named(
         find_map(frame_of(degree + 1))
 
 
+def test_sources_that_are_not_matched_are_told_where_terms_are_not_determined() -> None:
+    rng = np.random.default_rng(3)
+    here, there = (SourceCatalog(*rng.uniform(-30.0, 30.0, (2, 5)), np.full(5, 2e4)) for _ in "ab")
+    base = make_model(here, tolerance=1e-8)
+    model = replace(base, distortion=PolynomialDistortion.polynomial(3))
+    for sources, told in ((here, False), (there, True)):
+        counts = simulate(replace(base, sources=sources), np.zeros(12), 3.0, seed=34)
+        with pytest.raises(InputError, match="cannot determine") as caught:
+            find_map(Posterior(model, counts))
+        assert (" of 5 sources are matched to peaks" in str(caught.value)) == told
+
+
 @pytest.mark.parametrize("flux", ["fixed", "scale", "free"])
 @pytest.mark.parametrize(
     ("counts", "said"),

@@ -32,6 +32,7 @@ CLOSENESS = 1e-3
 Frames = TypeVar("Frames", Posterior, JointPosterior)
 
 MOST_NAMED = 3  # frames
+MATCHED = 0.5  # of the sources; of fewer the search rather than the terms is to blame
 STEPS = 8  # of Newton's method where the maximum itself is not wanted
 
 NO_DENSITY = (
@@ -184,10 +185,11 @@ def approach(
     """
     require_light(posterior)
     with one_blas_thread():
-        params = find_start(posterior).params if start is None else start
+        begun = next(_starts(posterior, start))
+        params = begun.params
         if not np.isfinite(posterior.log_prob(params)):
             raise InputError(NO_DENSITY)
-        _require_determined(posterior, params, posterior.fisher(params))
+        _require_determined(posterior, begun, posterior.fisher(params))
         kept = keep_all(posterior, params)[0]
         if rejecting:  # a PSF that is not the frame's leaves a share of all light
             kept, params, _ = reject(posterior, params, COARSE)
@@ -213,7 +215,7 @@ def _search(
             information = None
             if top is None:
                 fisher = posterior.fisher(begun.params)
-                _require_determined(posterior, begun.params, fisher)
+                _require_determined(posterior, begun, fisher)
                 information = fisher + posterior.prior_information(begun.params)
             kept, origin, spent = rejecting(posterior, begun.params)
             known = information if origin is begun.params else None
@@ -229,13 +231,18 @@ def _search(
         return found.posterior, _judged(posterior, found, search, evaluations, path)
 
 
-def _require_determined(posterior: Posterior, params: Floats, fisher: Floats) -> None:
-    if weak := undetermined(posterior, params, fisher):
-        degree = determined_degree(posterior, params, fisher)
+def _require_determined(posterior: Posterior, begun: Start, fisher: Floats) -> None:
+    if weak := undetermined(posterior, begun.params, fisher):
+        degree = determined_degree(posterior, begun.params, fisher)
         fewer = "leave out terms"
         if degree:
             fewer += f" of a degree above {degree} (distortion.degree = {degree} in a run file)"
         number = len(posterior.model.sources)
+        if begun.path and begun.matched < MATCHED * number:
+            fewer += (
+                ", check the catalogue's columns, unit and origin (at the start "
+                f"{begun.matched} of {number} sources are matched to peaks)"
+            )
         raise InputError(
             f"parameters: the frame cannot determine {', '.join(weak)} by its {number} "
             f"source{'s' * (number != 1)}, expected each to move the counts by more than their "
