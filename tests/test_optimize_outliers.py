@@ -21,7 +21,7 @@ from bayesfred.optimize import outliers
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map, reject_outliers
 from bayesfred.optimize.matching import Field
-from bayesfred.optimize.outliers import reject, reject_once
+from bayesfred.optimize.outliers import reject, reject_once, share_lost
 
 Floats = NDArray[np.float64]
 
@@ -320,6 +320,24 @@ def test_crowded_fields_are_right_or_said_not_to_fit(monkeypatch: pytest.MonkeyP
         assert not (wrong and estimate.fits_data), f"seed {seed}: {estimate.message}"
     assert right >= 20
     assert silent >= 1
+
+
+def test_the_share_of_lost_sources_counts_removed_and_masked_ones() -> None:
+    posterior, truth, *_ = frame(3, n=0)
+    s = posterior.model.sources
+    kept = replace(s, x=s.x[5:], y=s.y[5:], flux=s.flux[5:])  # 5 removed
+    mask = posterior.mask.copy()
+    mask[:60] = False
+    rest = Posterior(replace(posterior.model, sources=kept), posterior.counts, mask=mask)
+    images = posterior.likelihood.image_positions(truth)
+    row = np.rint(images[:, 1] + 0.5 * (len(mask) - 1))
+    lost = 5 + np.sum(row[5:] < 60)
+    assert 10 < lost < 40
+    assert share_lost(posterior, rest, truth) == pytest.approx(lost / 81)
+    assert share_lost(posterior, posterior, truth) == 0.0
+    assert share_lost(replace(posterior, mask=mask), rest, truth) == pytest.approx(
+        5 / (5 + np.sum(row[5:] >= 60))
+    )  # masked before
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])

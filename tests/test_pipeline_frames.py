@@ -88,6 +88,22 @@ def test_a_far_off_start_of_a_psf_to_measure_is_not_used(
     assert len(found) == said and np.allclose(list(map(float, found)), 2.0, rtol=0.15), lines
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [0.4, -1.0])
+def test_a_measured_psf_does_not_hide_that_most_sources_were_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: float
+) -> None:
+    """The search after it rejects nothing itself. Here no share of the sources is few enough."""
+    run = write(tmp_path, '[nuisances]\nflux = "free"')
+    text = run.read_text().replace("sigma = 2.0", 'kind = "measured"\nsigma = 2.0')
+    run.write_text(text.replace("[frame]", "[frame]\nreject_outliers = true"))
+    monkeypatch.setattr(pipeline, "BREAKDOWN", most)
+    _, estimate, _ = pipeline.read_frame(read_settings(run), run, None)
+    assert estimate is not None and estimate.at_maximum
+    assert estimate.fits_data == (most > 0.0)
+    assert ("over 40 % of the sources" in estimate.message) == (most < 0.0)
+
+
 def test_free_fluxes_need_no_column(tmp_path: Path) -> None:
     run = write(tmp_path, '[nuisances]\nflux = "free"')
     _, estimate = fitted(run)

@@ -21,11 +21,12 @@ from bayesfred.io.pixel_maps import read_mapped_frame
 from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.find_map import approach, find_map, reject_outliers
+from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
 from bayesfred.optimize.hot_pixels import hot_pixels, pixels_named
 from bayesfred.optimize.image_widths import image_widths
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
+from bayesfred.optimize.outliers import BREAKDOWN, share_lost
 from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
@@ -94,6 +95,7 @@ def read_frame(
             with working(show=say is not None):
                 posterior, estimate, lines = _follow(posterior, rough=rough)
             note(*lines)
+        given = posterior
         if f.reject_outliers:
             with working(show=say is not None):
                 start = None if estimate is None else estimate.params
@@ -114,7 +116,7 @@ def read_frame(
             note(line if lost.any() else "")
             posterior = measured
             note(psf_message(posterior, estimate))
-    return posterior, estimate, notes
+    return posterior, _judged(given, posterior, estimate), notes
 
 
 def _by_its_peaks(
@@ -173,6 +175,16 @@ def _with_measured_psf(
         )  # fmt: skip
     posterior = marginalize_psf(posterior, estimate)
     return posterior, find_map(posterior, estimate.params)
+
+
+def _judged(given: Posterior, kept: Posterior, estimate: MapEstimate | None) -> MapEstimate | None:
+    """The maximum, which does not fit where most of the sources were rejected on the way."""
+    if estimate is None or not estimate.fits_data:
+        return estimate
+    if share_lost(given, kept, estimate.params) <= BREAKDOWN:
+        return estimate
+    message = f"{estimate.message}; {MOSTLY_REJECTED}"
+    return replace(estimate, message=message, fits_data=False)
 
 
 def _census(posterior: Posterior, kept: Posterior) -> str:

@@ -115,6 +115,32 @@ def reject(
     return kept, params, evaluations
 
 
+def share_lost(given: Posterior, kept: Posterior, params: Floats) -> float:
+    """The share of the sources in a posterior's pixels that are not in what is kept of it.
+
+    Parameters
+    ----------
+    given, kept : Posterior
+    params : ndarray, shape (d,)
+        Of the kept one.
+
+    Returns
+    -------
+    float
+        Of sources that were removed, and those whose middle is masked.
+    """
+    step, (ny, nx) = given.model.detector.binning, given.mask.shape
+    place = kept.likelihood.image_positions(params)[:, ::-1] / step + 0.5 * np.array(
+        [ny - 1, nx - 1]
+    )
+    row, column = np.rint(place[np.isfinite(place).all(axis=1)]).astype(int).T
+    inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
+    row, column = row[inside], column[inside]
+    removed = len(given.model.sources) - len(kept.model.sources)
+    held, all_of_them = kept.mask[row, column].sum(), given.mask[row, column].sum() + removed
+    return 1.0 - float(held / max(all_of_them, 1))
+
+
 def reject_once(
     posterior: Posterior, params: Floats, tolerances: Sequence[float] = TOLERANCES
 ) -> Kept:
