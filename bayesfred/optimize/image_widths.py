@@ -14,6 +14,7 @@ from bayesfred.optimize.peaks import beside
 STARS = 30  # peaks by which the width is measured
 SHARP = 0.25  # of a peak's height beside it; an image of FWHM 1 has more, also in a pixel's middle
 START = 1.5  # pixels
+MOST = 2048  # rows and columns in the middle of a large frame, which are looked at
 NARROWEST, WIDEST = 0.5, 20.0  # pixels
 
 
@@ -34,7 +35,7 @@ class ImageWidths(NamedTuple):
 def image_widths(image: Floats) -> ImageWidths | None:
     """Measure the widths of the brightest images.
 
-    Pixels beside which there is next to nothing are hot ones.
+    Pixels beside which there is next to nothing are hot. Of a large frame the middle is enough.
 
     Parameters
     ----------
@@ -46,6 +47,8 @@ def image_widths(image: Floats) -> ImageWidths | None:
     ImageWidths or None
         None where there is no peak.
     """
+    top, left = (max(side - MOST, 0) // 2 for side in image.shape)
+    image = image[top : top + MOST, left : left + MOST]
     valid = np.isfinite(image)
     if not valid.any():
         return None
