@@ -82,7 +82,9 @@ def measure_psf(
     given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
     psf, state, drawn = find_psf(posterior, estimate, oversampling, degree)
     bare, top = _near(posterior, estimate, psf, model_error, given)
-    for _ in range(ROUNDS if reject_outliers else 0):
+    # single sharp pixels hide no others
+    rounds = ROUNDS if bare.nuisances.model_error else 1
+    for _ in range(rounds if reject_outliers else 0):
         kept = _explained(bare, top.params)
         if np.array_equal(kept, posterior.mask):
             break
