@@ -41,6 +41,7 @@ from bayesfred.analysis.verdict import (
 from bayesfred.io.summary_table import Table, make_table, stacked
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
@@ -236,6 +237,7 @@ class Diagnostics:
         }
 
 
+@one_blas_thread()  # matrices too small to be shared
 def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -> Diagnostics:
     """Judge how a chain is sampled, whether its model fits the counts, and what its prior does.
 

@@ -18,6 +18,7 @@ from bayesfred.errors import InputError, printable
 from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io import atomic, marks, outputs, paths, tables
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.reporting.figures import page_figures
 from bayesfred.reporting.frames import FittedFrame
@@ -214,6 +215,7 @@ def _record(job: Job) -> RunRecord:
     return RunRecord(title, frame, text, tuple(job.notes), job.truth)
 
 
+@one_blas_thread()  # matrices too small to be shared
 def write_results(
     chain: Chain,
     path: Path,
@@ -262,6 +264,7 @@ def write_results(
     return result
 
 
+@one_blas_thread()  # matrices too small to be shared
 def write_page(
     chain: Chain,
     path: Path,
