@@ -44,6 +44,7 @@ T. S. Breusch, A. R. Pagan (1980), Review of Economic Studies 47, 239: scores of
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -157,11 +158,11 @@ def source_tests(
     -------
     SourceTests
     """
-    number, owner, free = fits.fluxes.size, fits.owner, posterior.nuisances.profiled
+    first, free = fits.own.first, posterior.nuisances.profiled
     templates = _templates(fits.own.templates)
-    score = _by_source(owner, templates * fits.sums.pull, number)
+    score = _by_source(first, templates, fits.sums.pull[None])[..., 0]
     weighted = templates * fits.sums.weight
-    information = np.stack([_by_source(owner, w * templates, number) for w in weighted], axis=1)
+    information = _by_source(first, weighted, templates)
     root, known = _inverse_root(information)
     z = np.einsum("skj,sj->sk", root, score)
     cross = root @ information[:, :, :4]
@@ -174,9 +175,10 @@ def source_tests(
         # the scatter at the maximum is too small by what the coefficients took
         z[:, PLACE] *= np.sqrt(np.mean((share / alone)[:, PLACE][tested[:, PLACE]]))
     variance, slope = 1.0 / fits.sums.weight, _slope(posterior, params, fits)
-    for k in range(z.shape[1]):
-        weights = np.einsum("ij,ji->i", root[owner, k], weighted)
-        z[:, k] = _deviates(z[:, k], (weights, variance, slope), owner)
+    for each, (begin, end) in zip(root, pairwise(first), strict=True):
+        weighted[:, begin:end] = each @ weighted[:, begin:end]
+    for k, weights in enumerate(weighted):
+        z[:, k] = _deviates(z[:, k], (weights, variance, slope), fits.owner)
     z = np.column_stack([_chi_square(fits, taken, free), z])
     return SourceTests(z, _discoveries(z), _spreads(covariance, fits, taken, slope, free))
 
@@ -188,9 +190,10 @@ def _templates(own: Floats) -> Floats:
     return np.stack([s, x, y, width, (x**2 - y**2) * inverse, 2.0 * x * y * inverse])
 
 
-def _by_source(owner: Ints, values: Floats, number: int) -> Floats:
-    """Sums over each source's samples, shape (s, k) of values (k, samples)."""
-    return np.stack([np.bincount(owner, row, number) for row in values], axis=1)
+def _by_source(first: Ints, left: Floats, right: Floats) -> Floats:
+    """Sums of products over each source's samples, shape (s, k, m)."""
+    ends = pairwise(first)
+    return np.array([left[:, begin:end] @ right[:, begin:end].T for begin, end in ends])
 
 
 def _diagonal(cross: Floats, spread: Floats) -> Floats:
@@ -228,7 +231,7 @@ def _deviates(z: Floats, terms: tuple[Floats, Floats, Floats], owner: Ints) -> F
     `terms` are the weights, and each sample's variance with its slope.
     """
     a, variance, slope = terms
-    kurtosis = np.bincount(owner, a**4 * variance * slope**2, z.size)
+    kurtosis = np.bincount(owner, (a * a * slope) ** 2 * variance, z.size)
     z = np.where(kurtosis * FEWEST <= 1.0, z, np.nan)
     far = (np.abs(z) > NORMAL) & (np.abs(z) < CERTAIN)
     if not far.any():
@@ -301,18 +304,17 @@ def _spread(
 ) -> Spread | None:
     """The sum of the squared scores against its mean and variance for a true model."""
     (name, rows), own, weight, number = test, fits.own, fits.sums.weight, fits.fluxes.size
+    templates = own.templates[rows]
     diagonal = np.einsum("skk->sk", fits.information)[:, rows]
-    score = _by_source(fits.owner, own.templates[rows] * fits.sums.pull, number)
+    score = _by_source(own.first, templates, fits.sums.pull[None])
     left = fits.information - fits.information @ taken.spread @ fits.information
     expected = float(np.einsum("skk->k", left)[rows].sum())
     # sources that share pixels have correlated scores
     pixels = int(own.pixel.max(initial=0)) + 1
     half = sparse.hstack(
         [
-            sparse.csc_matrix(
-                (own.templates[k] * np.sqrt(weight), own.pixel, own.first), (pixels, number)
-            )
-            for k in rows
+            sparse.csc_matrix((template * np.sqrt(weight), own.pixel, own.first), (pixels, number))
+            for template in templates
         ]
     )
     overlaps = (half.T @ half).tocsr()
@@ -321,7 +323,7 @@ def _spread(
     squares = float(overlaps.multiply(overlaps).sum())
     lost = 2.0 * np.trace(covariance @ (absorbed.T @ (overlaps @ absorbed)))
     # counts are not Gaussian: the fourth cumulants
-    tail = float(np.sum(own.templates[rows] ** 4 * weight**3 * slope**2))
+    tail = float(np.sum((templates * templates * weight * slope) ** 2 * weight))
     variance = 2.0 * (squares - lost + float(np.trace(inner @ inner))) + tail
     if not (expected > LEFT * diagonal.sum() and variance > 0.0):
         return None
