@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.path import Path as Outline
 from matplotlib.quiver import Quiver
 from numpy.typing import NDArray
 from scipy.stats import norm
@@ -40,7 +41,7 @@ from bayesfred.reporting.frames import MASKED, FittedFrame, star_panels
 from bayesfred.reporting.html import write_report
 from bayesfred.reporting.labels import axis_label, math_symbol
 from bayesfred.reporting.pairs import corner_parameters, corner_plot
-from bayesfred.reporting.panels import round_ticks
+from bayesfred.reporting.panels import Images, Sheet, round_ticks
 from bayesfred.reporting.posteriors import marginal_plot, overview, trace_plot
 from bayesfred.reporting.screen import parameter_table
 from bayesfred.reporting.style import embedded, png
@@ -140,8 +141,13 @@ def boxes_of(figure: Figure) -> list[Floats]:
 
 def colour_at(figure: Figure, place: Floats) -> Floats:
     """The colour of a sheet's images at a place in inches."""
-    column, row = (100.0 * place).astype(int)
-    return np.asarray(values(figure.axes[0]))[row, column] / 255.0
+    (artist,) = (a for a in figure.axes[0].artists if isinstance(a, Images))
+    for (left, bottom, *size), colours in artist.images:
+        share = (place - (left, bottom)) / size
+        if np.all((share >= 0.0) & (share < 1.0)):
+            column, row = (share * colours.shape[1::-1]).astype(int)
+            return np.asarray(colours)[row, column] / 255.0
+    raise AssertionError(place)
 
 
 def values(ax: Any) -> Any:
@@ -593,7 +599,41 @@ def test_a_corner_of_some_shows_the_correlations_of_all() -> None:
         red, _, blue, _ = colour_at(figure, np.array([corner[k[1], 0], corner[k[0], 1]]))
         assert (red > blue + 0.3) if colour == "red" else (blue > red + 0.3)
     everything = corner_plot(draws, parameters)
-    assert len(boxes_of(everything)) == 78 and not everything.axes[0].images
+    assert len(boxes_of(everything)) == 78 and not everything.axes[0].artists
+
+
+def test_areas_hold_their_shares_of_the_draws() -> None:
+    """Of two normal variables, correlated, then of a ring, whose middle is left free."""
+    rng = np.random.default_rng(5)
+    normal = rng.multivariate_normal([1.0, -2.0], [[1.0, 0.7], [0.7, 2.0]], 20_000)
+    angle, radius = rng.uniform(0.0, 2.0 * np.pi, 20_000), rng.normal(5.0, 1.2, 20_000)
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    for draws in (normal, ring):
+        figure = corner_plot(draws, described("name 0", "name 1"))
+        place = boxes_of(figure)[1]
+        low, high = (np.quantile(draws, q, axis=0) for q in (0.001, 0.999))
+        start, size = low - 0.08 * (high - low), 1.16 * (high - low)
+        points = place[0] + (draws - start) / size * (place[1] - place[0])
+        areas = [c for c in figure.axes[0].collections if isinstance(c, PathCollection)]
+        for alpha, share in ((1.0, 1.0 - np.exp(-0.5)), (1 / 3, np.exp(-0.5) - np.exp(-2.0))):
+            (area,) = (c for c in areas if c.get_alpha() == pytest.approx(alpha))
+            rings = [ring for path in area.get_paths() for ring in path.to_polygons()]
+            inside = np.logical_xor.reduce(
+                [Outline(ring).contains_points(points) for ring in rings]
+            )
+            assert np.mean(inside) == pytest.approx(share, abs=0.05)
+
+
+def test_images_are_put_where_their_boxes_are() -> None:
+    """Every pixel of the figure has the colour of the nearest of the image, its first row below."""
+    sheet = Sheet(0.5, 0.4)
+    colours = np.random.default_rng(3).integers(0, 256, (2, 3, 4)).astype(np.uint8)
+    colours[..., 3] = 255
+    sheet.image((0.1, 0.2, 0.3, 0.1), colours)
+    seen = np.rint(255.0 * pixels(sheet.finish())).astype(int)[::-1]
+    np.testing.assert_array_equal(seen[20:30, 10:40], colours.repeat(5, axis=0).repeat(10, axis=1))
+    seen[20:30, 10:40] = 255
+    assert np.all(seen == 255)
 
 
 def test_corner_chooses_the_most_correlated_pairs() -> None:

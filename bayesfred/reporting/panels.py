@@ -2,15 +2,18 @@
 
 Every `Axes` of matplotlib costs 10 ms, for its ticks above all, and a chain of 28 parameters has
 hundreds of panels. So a `Sheet` has a single one, in inches, and a `Panel` is a rectangle of it
-that maps its data there. Lines of one look become one collection.
+that maps its data there. Lines and areas of one look become one collection, and images are put in
+the figure's own pixels.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.artist import Artist
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
+from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -73,7 +76,7 @@ class Sheet:
         self.panels: list[Panel] = []
         self._images: list[tuple[Box, Colours]] = []
         self._lines: dict[Look, list[Floats]] = {}
-        self._areas: dict[Look, list[Floats]] = {}
+        self._areas: dict[Look, list[Path]] = {}
 
     def panel(self, box: Box, x: Span, y: Span) -> "Panel":
         """A framed rectangle whose data have the ranges `x` and `y`."""
@@ -84,9 +87,9 @@ class Sheet:
         """A line through points in inches, shape (n, 2)."""
         self._lines.setdefault(tuple(look.items()), []).append(points)
 
-    def area(self, points: Floats, **look: Any) -> None:
-        """A polygon in inches, shape (n, 2)."""
-        self._areas.setdefault(tuple(look.items()), []).append(points)
+    def area(self, points: Floats, codes: Colours | None = None, **look: Any) -> None:
+        """A polygon in inches, shape (n, 2), with the codes of a path if it is of several parts."""
+        self._areas.setdefault(tuple(look.items()), []).append(Path(points, codes))
 
     def image(self, box: Box, colours: Colours) -> None:
         """An image of RGBA values, its first row below, unsmoothed."""
@@ -113,10 +116,10 @@ class Sheet:
     def finish(self) -> Figure:
         """The figure, with all that was asked for."""
         if self._images:
-            self._show_images()
+            self.axes.add_artist(Images(self._images))
         for areas, look in ((areas, dict(key)) for key, areas in self._areas.items()):
             self.axes.add_collection(
-                PolyCollection(areas, edgecolors="none", **look), autolim=False
+                PathCollection(areas, edgecolors="none", **look), autolim=False
             )
         for lines, look in ((lines, dict(key)) for key, lines in self._lines.items()):
             self.axes.add_collection(LineCollection(lines, capstyle="butt", **look), autolim=False)
@@ -127,24 +130,27 @@ class Sheet:
         )
         return self.figure
 
-    def _show_images(self) -> None:
-        """All images as one, of the figure's own pixels."""
-        shape = round(DPI * self.height), round(DPI * self.width)
-        all_of_it = np.zeros((*shape, 4), dtype=np.uint8)
-        for (left, bottom, width, height), colours in self._images:
+
+class Images(Artist):
+    """Images of RGBA values in boxes, every pixel of the figure with the colour of the nearest."""
+
+    def __init__(self, images: Sequence[tuple[Box, Colours]]) -> None:
+        super().__init__()
+        self.images = images
+
+    def draw(self, renderer: Any) -> None:
+        """Put the images below everything else."""
+        context, dots = renderer.new_gc(), renderer.points_to_pixels(72.0)
+        for (left, bottom, width, height), colours in self.images:
+            ends = ((bottom, height), (left, width))
+            sizes = (max(round(dots * (p + size)) - round(dots * p), 1) for p, size in ends)
             rows, columns = (
-                np.arange(round(DPI * start), max(round(DPI * (start + size)), 1))
-                for start, size in ((bottom, height), (left, width))
+                ((np.arange(size) + 0.5) * n / size).astype(int)
+                for size, n in zip(sizes, colours.shape[:2], strict=True)
             )
-            r, c = (
-                (np.arange(len(there)) + 0.5) * n // max(len(there), 1)
-                for there, n in zip((rows, columns), colours.shape[:2], strict=True)
-            )
-            all_of_it[np.ix_(rows, columns)] = colours[np.ix_(r.astype(int), c.astype(int))]
-        self.axes.imshow(
-            all_of_it, extent=(0.0, shape[1] / DPI, 0.0, shape[0] / DPI), aspect="auto",
-            origin="lower", interpolation="nearest",
-        )  # fmt: skip
+            shown = colours[np.ix_(rows, columns)]
+            renderer.draw_image(context, round(dots * left), round(dots * bottom), shown)
+        context.restore()
 
 
 class Panel:

@@ -3,6 +3,7 @@
 import base64
 import io
 import struct
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,6 +61,7 @@ def png(figure: Figure, dpi: int = 100, *, shades: bool = True) -> bytes:
     """
     figure.set(dpi=dpi, facecolor="white")
     canvas: Any = FigureCanvasAgg(figure)  # whose methods have no types
+    canvas.get_renderer().mathtext_parser = _mathematics()
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     # the former of Pillow's methods keeps rare colours, such as those at a scale's ends
@@ -68,6 +70,13 @@ def png(figure: Figure, dpi: int = 100, *, shades: bool = True) -> bytes:
     buffer = io.BytesIO()
     few.save(buffer, "png")
     return buffer.getvalue()
+
+
+@cache
+def _mathematics() -> Any:
+    """What sets symbols, for all figures: it keeps those of before."""
+    canvas: Any = FigureCanvasAgg(Figure())
+    return canvas.get_renderer().mathtext_parser
 
 
 class Embedded(NamedTuple):
