@@ -40,7 +40,7 @@ from bayesfred.imaging.monomials import Exponents, U, V, X, Y, newton
 STEPS = 8  # from the axis to a point
 MANY = 2**12  # points, from which on the roots of a grid are followed in their place
 GRID = 33  # points along each side of that grid
-BLOCK = 2**13  # points that are solved at once: what fits the caches
+BLOCK = 2**14  # roots that are looked for at once: what fits the caches
 
 Terms = tuple[Floats, Sequence[Exponents]]  # coefficients, shape (n, n_terms), and their monomials
 Reduced = dict[tuple[int, int], Floats]  # c_ij by (i, j)
@@ -67,13 +67,14 @@ def object_positions(f: Terms, g: Terms, u: Floats, v: Floats, offset: Floats) -
     out = np.empty((2, len(f[0]), u.size))
     for some in _blocks(u.size):
         at = u[some], v[some]
-        equations = _objects(f, g, *at, offset)
         if near is None:
             start = _followed(*middle, *at)
         else:
             x, y = near[0][:, some], near[1][:, some]
             start = x, y, np.array(_objects(*middle[:2], *at, middle[2])(x, y)[2:])
-        out[:, :, some] = _root(equations, *start)[:2]
+        for n in _blocks(len(f[0]), max(BLOCK // at[0].size, 1)):
+            equations = _objects((f[0][n], f[1]), (g[0][n], g[1]), *at, offset[n])
+            out[:, n, some] = _root(equations, *start)[:2]
     return out
 
 
@@ -215,8 +216,8 @@ def _between(
     return found_x, found_y
 
 
-def _blocks(size: int) -> Iterator[slice]:
-    return (slice(first, first + BLOCK) for first in range(0, size, BLOCK))
+def _blocks(size: int, most: int = BLOCK) -> Iterator[slice]:
+    return (slice(first, first + most) for first in range(0, size, most))
 
 
 def _root(
@@ -243,30 +244,31 @@ def _reduced(
     at: tuple[int, int],
     free: tuple[int, int],
 ) -> Reduced:
-    """The coefficients of the powers of the free variables, shape (n, points) each."""
+    """The coefficients of the powers of the free variables, shape (n, points) or (n, 1) each."""
     by_power: dict[tuple[int, int], list[int]] = {}
     for k, term in enumerate(terms):
         by_power.setdefault((term[free[0]], term[free[1]]), []).append(k)
     p, q = fixed
-    return {
-        power: theta[:, some]
-        @ np.array([p ** terms[k][at[0]] * q ** terms[k][at[1]] for k in some])
-        for power, some in by_power.items()
-    }
+    found: Reduced = {}
+    for power, some in by_power.items():
+        if any(terms[k][axis] for k in some for axis in at):
+            powers = np.array([p ** terms[k][at[0]] * q ** terms[k][at[1]] for k in some])
+            found[power] = theta[:, some] @ powers
+        else:  # the same at all points
+            found[power] = theta[:, some].sum(axis=1, keepdims=True)
+    return found
 
 
 def _evaluated(reduced: Reduced, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-    """The sum of c_ij x^i y^j and its derivatives along x and y."""
-    degrees = np.max([(0, 0), *reduced], axis=0)
-    xs, ys = ([np.ones_like(p)] for p in (x, y))
-    for powers, p, degree in zip((xs, ys), (x, y), degrees, strict=True):
-        for _ in range(degree):
-            powers.append(powers[-1] * p)
+    """The sum of c_ij x^i y^j and its derivatives along x and y, by Horner's scheme."""
     value, along_x, along_y = (np.zeros_like(x) for _ in range(3))
-    for (i, j), c in reduced.items():
-        value += c * xs[i] * ys[j]
-        if i:
-            along_x += c * (i * xs[i - 1] * ys[j])
-        if j:
-            along_y += c * (j * xs[i] * ys[j - 1])
+    for i in range(max((i for i, _ in reduced), default=-1), -1, -1):
+        row: Floats | float = 0.0  # the polynomial in y that x^i is multiplied by
+        slope: Floats | float = 0.0
+        for j in range(max((j for k, j in reduced if k == i), default=-1), -1, -1):
+            slope = slope * y + row
+            row = row * y + reduced.get((i, j), 0.0)
+        along_x = along_x * x + value
+        value = value * x + row
+        along_y = along_y * x + slope
     return value, along_x, along_y

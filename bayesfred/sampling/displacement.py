@@ -26,7 +26,7 @@ __all__ = ["displacement", "frame_posterior", "spread_draws"]
 
 # A standard deviation of this many independent draws has an error of 2.2 %, a variance of 4.5 %.
 MOST_DRAWS = 1000
-BLOCK = 2**16  # roots that are looked for at once: what fits the caches
+BLOCK = 2**18  # roots that are kept at once
 
 
 def displacement(chain: "Chain", u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Floats, Floats]:
