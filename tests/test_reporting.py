@@ -133,6 +133,11 @@ def texts_of(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.axes[0].texts]
 
 
+def heights_of(figure: Figure) -> list[tuple[str, float]]:
+    """What is written on a sheet of panels, and how high above its lower edge, inch."""
+    return [(text.get_text(), text.get_position()[1]) for text in figure.axes[0].texts]
+
+
 def boxes_of(figure: Figure) -> list[Floats]:
     """Lower left and upper right corners of a sheet's panels, inch, each of shape (2, 2)."""
     frames: Any = figure.axes[0].collections[-1]
@@ -724,24 +729,34 @@ def test_trace_has_a_panel_for_every_parameter(d: int) -> None:
 def test_triptych_axes_count_pixels_from_the_middle(shape: tuple[int, int]) -> None:
     ny, nx = shape
     expected = np.full(shape, 4.0)
-    expected[ny // 4, nx // 4] = 4000.0
+    mask, middle = np.zeros(shape, bool), np.zeros(shape, bool)
+    mask[ny // 4 - 6 : ny // 4 + 7, nx // 4 - 6 : nx // 4 + 7] = True
+    middle[ny // 4 - 3 : ny // 4 + 4, nx // 4 - 3 : nx // 4 + 4] = True
+    expected[middle] = 4000.0
     counts = np.random.default_rng(4).poisson(expected).astype(float)
-    mask = np.zeros(shape, bool)
-    mask[ny // 4 - 3 : ny // 4 + 4, nx // 4 - 3 : nx // 4 + 4] = True
+    counts[middle] = 4000.0 + 4.0 * np.sqrt(4000.0)
     # not the root of the counts: the noise model's word is taken
     fitted = FittedFrame(counts, expected, 2.0 * np.sqrt(expected), mask)
     figure = overview(fitted, np.zeros((2, 1)), described("f_ux"))
-    frame, model, residual = figure.axes[:3]
-    for ax in (frame, model, residual):
-        assert ax.get_xlim() == (-nx / 2, nx / 2) and ax.get_ylim() == (-ny / 2, ny / 2)
-        assert ax.get_aspect() == 1.0
-    assert frame.images[0].norm is model.images[0].norm
-    assert residual.images[0].get_clim() == (-5.0, 5.0)
-    shown = values(residual)
-    assert np.ma.count(shown) == mask.sum()
-    assert float(shown[ny // 4, nx // 4]) == pytest.approx(
-        float((counts - expected)[ny // 4, nx // 4] / 4000.0**0.5 / 2.0)
-    )
+    boxes = boxes_of(figure)
+    frame, model, residual, *_ = boxes
+    for box in boxes[:3]:
+        width, height = box[1] - box[0]
+        assert height / width == pytest.approx(ny / nx)
+    bar = next(box for box in boxes[3:] if box[0, 0] > residual[1, 0])
+    star = (np.array([nx // 4, ny // 4]) + 0.5) / (nx, ny)
+    scale = bar[0] + (0.5, 0.7) * (bar[1] - bar[0])  # two standard deviations
+    shown, masked = (residual[0] + at * (residual[1] - residual[0]) for at in (star, 0.5))
+    np.testing.assert_allclose(colour_at(figure, shown), colour_at(figure, scale), atol=0.02)
+    assert colour_at(figure, masked) == pytest.approx(to_rgba(MASKED), abs=0.01)
+    dark, light = (colour_at(figure, model[0] + at * (model[1] - model[0])) for at in (star, 0.5))
+    assert dark[0] < 0.1 and light[0] > 0.8  # of one scale
+    assert colour_at(figure, frame[0] + star * (frame[1] - frame[0]))[0] < 0.1
+    # a tick at 100 pixels to the right of the middle, or 200 in the larger frame
+    value = "100" if nx < 600 else "200"
+    texts = [text for text in figure.axes[0].texts if text.get_text() == value]
+    across = frame[0, 0] + (0.5 + int(value) / nx) * (frame[1, 0] - frame[0, 0])
+    assert across in [pytest.approx(text.get_position()[0]) for text in texts]
     pixels(figure)
 
 
@@ -799,8 +814,24 @@ def test_overview_shows_frame_and_marginals(with_truth: bool) -> None:
     truth = np.append(TRUTH, BACKGROUND) if with_truth else None
     frame = fitted(posterior, chain.estimate.params)
     figure = overview(frame, chain.draws(), posterior.parameters, truth=truth)
-    marginals = next(ax for ax in figure.axes if "posterior mean" in ax.get_ylabel())
-    assert len(marginals.get_xticks()) == (5 if with_truth else 4)
+    number = 5 if with_truth else 4
+    texts = texts_of(figure)
+    assert sum(text.count("±") for text in texts) == number
+    assert f"{'(posterior mean − truth)' if with_truth else 'posterior mean'} / sd" in texts
+    draws = chain.draws()[:, :number]
+    z = (draws.mean(axis=0) - (TRUTH if number == 4 else truth) * with_truth) / draws.std(axis=0)
+    (points,) = figure.axes[0].lines
+    low, high = boxes_of(figure)[-1][:, 1]
+    ticks = {text: height for text, height in heights_of(figure) if low < height < high}
+    zero, two = ticks["0"], ticks["10" if "10" in ticks else "2"]
+    if with_truth:
+        expected = zero + z * (two - zero) / 2.0
+    else:  # logarithmic beyond three
+        far = np.log10(np.maximum(np.abs(z), 3.0) / 3.0)
+        expected = zero + np.sign(z) * (np.minimum(np.abs(z), 3.0) + 2.7 * far) * (
+            (two - zero) / (3.0 + 2.7 * np.log10(10.0 / 3.0))
+        )
+    np.testing.assert_allclose(points.get_ydata(), expected, atol=2e-3)
     pixels(figure)
 
 

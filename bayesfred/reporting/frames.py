@@ -12,15 +12,13 @@ from functools import partial
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, FuncNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
+from numpy.typing import NDArray
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.posterior import Posterior
-from bayesfred.reporting.panels import Sheet
+from bayesfred.reporting.panels import DPI, SMALL, Box, Panel, Sheet
 
 __all__ = [
     "FittedFrame",
@@ -34,6 +32,8 @@ __all__ = [
 COUNTS_MAP, RESIDUAL_MAP = "gray_r", "RdBu_r"
 MASKED = "#cfe3bf"  # a colour that neither map has
 RESIDUAL_LIMIT = 5.0
+RESIDUALS = RESIDUAL_MAP, (-RESIDUAL_LIMIT, RESIDUAL_LIMIT)
+NUMBERS, LABELS = 12.0, 13.0  # points, around a frame
 SIDE = 5.0  # inch of a frame's longer side, and of what stands around it
 LEFT, BELOW, ABOVE = 0.85, 0.65, 0.4
 MAX_STARS = 24
@@ -94,22 +94,17 @@ def residual_panels(frames: Sequence[FittedFrame]) -> Figure:
     columns = min(len(frames), 3)
     rows = -(-len(frames) // columns)
     high = max(triptych_height(frame) for frame in frames)
-    width, height = (LEFT + SIDE) * columns + 1.1, rows * high
-    fig = Figure(figsize=(width, height), dpi=100)
+    sheet = Sheet((LEFT + SIDE) * columns + 1.1, rows * high)
     for k, fitted in enumerate(frames):
         left = LEFT + (LEFT + SIDE) * (k % columns)
         bottom = BELOW + high * (rows - 1 - k // columns)
-        ax = _axes(fig, (left, bottom, high - BELOW - ABOVE))
-        ny, nx = fitted.counts.shape
-        extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
-        image = _show(ax, fitted.residual(), _sigma_norm(), RESIDUAL_MAP, extent)
-        ax.set_title(f"run {k + 1}", fontsize=15)
-        ax.set_xlabel("u / pixel", fontsize=13)
-        ax.set_ylabel("v / pixel", fontsize=13)
-        ax.tick_params(labelsize=12)
-    bar = fig.add_axes((1.0 - 0.95 / width, BELOW / height, 0.2 / width, 1.0 - 1.1 / height))
-    fig.colorbar(image, cax=bar).set_label("residual / sigma", fontsize=13)
-    return fig
+        place = left, bottom, high - BELOW - ABOVE
+        panel = _show(sheet, place, fitted.residual(), _sigma_norm(), RESIDUAL_MAP)
+        panel.label_above(f"run {k + 1}", fontsize=15)
+        panel.label_beside("v / pixel", 0.62, fontsize=13)
+    box = (sheet.width - 0.95, BELOW, 0.2, sheet.height - 1.1)
+    _bar(sheet, box, RESIDUALS, "residual / sigma")
+    return sheet.finish()
 
 
 def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -> Figure:
@@ -170,21 +165,8 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
                 )
         position = f"{round(u[s]):+d}, {round(v[s]):+d}".replace("-", "−")
         sheet.text(left + STAMP + 0.1, bottom + STAMP - 0.06, position, va="top", fontsize=8.5)
-    bar = sheet.panel(
-        (sheet.width - 0.65, 0.1, 0.14, sheet.height - 0.5),
-        (0.0, 1.0), (-RESIDUAL_LIMIT, RESIDUAL_LIMIT),
-    )  # fmt: skip
-    sheet.image(bar.box, colormaps[RESIDUAL_MAP](np.linspace(0.0, 1.0, 201)[:, None], bytes=True))
-    bar.ticks_beside(right=True)
-    sheet.text(
-        sheet.width - 0.08,
-        0.5 * sheet.height,
-        "residual / sigma",
-        rotation=90,
-        ha="right",
-        va="center",
-        fontsize=10,
-    )
+    box = (sheet.width - 0.65, 0.1, 0.14, sheet.height - 0.5)
+    _bar(sheet, box, RESIDUALS, "residual / sigma", sizes=(SMALL, 10.0))
     return sheet.finish()
 
 
@@ -203,61 +185,79 @@ def triptych_height(fitted: FittedFrame) -> float:
     return BELOW + ABOVE + SIDE * min(max(float(ny / nx), 0.25), 2.0)
 
 
-def draw_triptych(fig: Figure, fitted: FittedFrame) -> None:
-    """Show frame, model and residual at the top of a figure; the first two share a colour bar.
+def draw_triptych(sheet: Sheet, fitted: FittedFrame) -> None:
+    """Show frame, model and residual at the top of a sheet; the first two share a colour bar.
 
     Parameters
     ----------
-    fig : Figure
+    sheet : Sheet
         19 inches wide.
     fitted : FittedFrame
     """
-    ny, nx = fitted.counts.shape
-    extent = (-nx / 2, nx / 2, -ny / 2, ny / 2)
-    height = triptych_height(fitted) - BELOW - ABOVE
-    bottom = fig.get_figheight() - height - ABOVE
-    axes = [_axes(fig, (left, bottom, height)) for left in (LEFT, 6.55, 13.05)]
+    high = triptych_height(fitted) - BELOW - ABOVE
+    bottom = sheet.height - high - ABOVE
     norm = _stretch(fitted.counts[fitted.mask], fitted.expected[fitted.mask])
-    _show(axes[0], fitted.recorded(), norm, COUNTS_MAP, extent)
-    _show(axes[1], fitted.expected, norm, COUNTS_MAP, extent)
-    # inset axes are exactly as high as the image beside them
-    bar = fig.colorbar(
-        ScalarMappable(norm, COUNTS_MAP),
-        cax=axes[1].inset_axes((1.02, 0.0, 0.035, 1.0)),
+    frame, model, residual = (
+        _show(sheet, (left, bottom, high), values, scale, colours)
+        for left, values, scale, colours in (
+            (LEFT, fitted.recorded(), norm, COUNTS_MAP),
+            (6.4, fitted.expected, norm, COUNTS_MAP),
+            (13.05, fitted.residual(), _sigma_norm(), RESIDUAL_MAP),
+        )
     )
-    bar.set_label("counts per pixel", fontsize=13)
-    ticks = _even_ticks(norm)
-    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-    bar.minorticks_off()
-    residual = _show(axes[2], fitted.residual(), _sigma_norm(), RESIDUAL_MAP, extent)
-    scale = fig.colorbar(residual, cax=axes[2].inset_axes((1.02, 0.0, 0.035, 1.0)))
-    scale.set_label("residual / sigma", fontsize=13)
-    for ax, title in zip(axes, ("frame", "model", "residual"), strict=True):
-        ax.set_title(title, fontsize=15)
-        ax.set_xlabel("u / pixel", fontsize=13)
-    axes[0].set_ylabel("v / pixel", fontsize=13)
-    for ax in (*axes, bar.ax, scale.ax):
-        ax.tick_params(labelsize=12)
-
-
-def _axes(fig: Figure, place: tuple[float, float, float]) -> Axes:
-    """Axes of a frame, given by left, bottom and height in inches."""
-    (width, height), (left, bottom, high) = fig.get_size_inches(), place
-    return fig.add_axes((left / width, bottom / height, SIDE / width, high / height))
+    for panel, title in ((frame, "frame"), (model, "model"), (residual, "residual")):
+        panel.label_above(title, fontsize=15)
+    frame.label_beside("v / pixel", 0.62, fontsize=13)
+    values = _even_ticks(norm)
+    ticks = np.asarray(norm(values)), [f"{value:g}" for value in values]
+    bars = [(box[0] + box[2] + 0.1, box[1], 0.175, box[3]) for box in (model.box, residual.box)]
+    _bar(sheet, bars[0], (COUNTS_MAP, (0.0, 1.0)), "counts per pixel", ticks=ticks)
+    _bar(sheet, bars[1], RESIDUALS, "residual / sigma")
 
 
 def _show(
-    ax: Axes,
-    frame: Floats,
-    norm: Normalize,
-    colours: str,
-    extent: tuple[float, float, float, float],
-) -> AxesImage:
-    """An image, green where it is not finite; unsmoothed, so that noise stays noise."""
-    return ax.imshow(
-        np.ma.masked_invalid(frame), cmap=_colours(colours), norm=norm, extent=extent,
-        origin="lower", interpolation="nearest",
-    )  # fmt: skip
+    sheet: Sheet, place: tuple[float, float, float], frame: Floats, norm: Normalize, colours: str
+) -> Panel:
+    """A frame in a panel, green where it is not finite; unsmoothed, so that noise stays noise.
+
+    It is within `SIDE` of the left, and the height of the place is what is above the lower edge.
+    """
+    left, bottom, high = place
+    ny, nx = frame.shape
+    width, height = min(SIDE, high * nx / ny), min(high, SIDE * ny / nx)
+    box = (left + 0.5 * (SIDE - width), bottom + 0.5 * (high - height), width, height)
+    panel = sheet.panel(box, (-nx / 2, nx / 2), (-ny / 2, ny / 2), NUMBERS)
+    some = np.ix_(*(_shown(n, inches) for n, inches in ((ny, height), (nx, width))))
+    sheet.image(box, _colours(colours)(norm(np.ma.masked_invalid(frame[some])), bytes=True))
+    panel.ticks_below()
+    panel.ticks_beside()
+    panel.label_below("u / pixel", 0.33, fontsize=LABELS)
+    return panel
+
+
+def _shown(number: int, inches: float) -> NDArray[np.int64]:
+    """Which of some rows or columns are seen in a figure."""
+    most = min(number, max(round(DPI * inches), 1))
+    return ((np.arange(most) + 0.5) * number / most).astype(np.int64)
+
+
+def _bar(
+    sheet: Sheet,
+    box: Box,
+    scale: tuple[str, tuple[float, float]],
+    label: str,
+    *,
+    ticks: tuple[Floats, list[str]] | None = None,
+    sizes: tuple[float, float] = (NUMBERS, LABELS),
+) -> None:
+    """A colour bar with its label, numbers and label in these sizes."""
+    colours, span = scale
+    sheet.image(box, colormaps[colours](np.linspace(0.0, 1.0, 256)[:, None], bytes=True))
+    bar = sheet.panel(box, (0.0, 1.0), span, sizes[0])
+    right = bar.ticks_beside(right=True, given=ticks)
+    sheet.text(
+        right + 0.05, box[1] + 0.5 * box[3], label, rotation=90, va="center", fontsize=sizes[1]
+    )
 
 
 def _colours(name: str) -> Colormap:

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from bayesfred._typing import Floats
 
-__all__ = ["Panel", "Sheet", "round_ticks"]
+__all__ = ["Box", "Images", "Panel", "Sheet", "round_ticks"]
 
 DPI = 100
 TICK = 0.03  # inch
+TICKED = 0.8  # inch from tick to tick, where there is room for more than a few
 SMALL = 8.0  # points
 CHARACTER = 0.07  # inch, of this size
 
@@ -32,12 +33,14 @@ Colours = NDArray[np.uint8]
 Look = tuple[tuple[str, Any], ...]
 
 
-def round_ticks(low: float, high: float) -> tuple[Floats, list[str]]:
+def round_ticks(low: float, high: float, most: int = 5) -> tuple[Floats, list[str]]:
     """Round numbers within a range, none at its very ends, and how they are written.
 
     Parameters
     ----------
     low, high : float
+    most : int
+        Parts that they divide the range into, at most.
 
     Returns
     -------
@@ -50,7 +53,7 @@ def round_ticks(low: float, high: float) -> tuple[Floats, list[str]]:
     ['−2', '0', '2']
     """
     edge = 0.06 * (high - low)
-    ticks = np.asarray(MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(low, high))
+    ticks = np.asarray(MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(low, high))
     ticks = ticks[(ticks > low + edge) & (ticks < high - edge)]
     step = float(np.min(np.diff(ticks), initial=high - low))
     decimals = 0
@@ -78,9 +81,9 @@ class Sheet:
         self._lines: dict[Look, list[Floats]] = {}
         self._areas: dict[Look, list[Path]] = {}
 
-    def panel(self, box: Box, x: Span, y: Span) -> "Panel":
-        """A framed rectangle whose data have the ranges `x` and `y`."""
-        self.panels.append(Panel(self, box, x, y))
+    def panel(self, box: Box, x: Span, y: Span, size: float = SMALL) -> "Panel":
+        """A framed rectangle whose data have the ranges `x` and `y`, its numbers of this size."""
+        self.panels.append(Panel(self, box, x, y, size))
         return self.panels[-1]
 
     def line(self, points: Floats, **look: Any) -> None:
@@ -156,8 +159,9 @@ class Images(Artist):
 class Panel:
     """A rectangle of a sheet with its own ranges; `Sheet.panel` makes it."""
 
-    def __init__(self, sheet: Sheet, box: Box, x: Span, y: Span) -> None:
-        self.sheet, self.box, self.x, self.y = sheet, box, x, y
+    def __init__(self, sheet: Sheet, box: Box, x: Span, y: Span, size: float) -> None:
+        self.sheet, self.box, self.x, self.y, self.size = sheet, box, x, y, size
+        self.tick = TICK * size / SMALL
         self.ticks: list[Floats] = []
 
     def at(self, x: Floats | float, y: Floats | float) -> Floats:
@@ -203,24 +207,46 @@ class Panel:
 
     def ticks_below(self, *, labelled: bool = True) -> None:
         """Round numbers along the lower edge, as many as there is room for."""
-        values, labels = round_ticks(*self.x)
-        if sum(len(label) + 1 for label in labels) * CHARACTER > self.box[2]:
-            values, labels = values[::2], labels[::2]
+        values, labels = round_ticks(*self.x, max(5, int(self.box[2] / TICKED)))
+        needed = sum(len(label) + 1 for label in labels) * CHARACTER * self.size / SMALL
+        few = slice(None, None, 1 + int(needed / self.box[2]))
+        values, labels = values[few], labels[few]
         for (x, y), label in zip(self.at(values, self.y[0]), labels, strict=True):
-            self.ticks.append(np.array([(x, y), (x, y - TICK)]))
+            self.ticks.append(np.array([(x, y), (x, y - self.tick)]))
             if labelled:
-                self.sheet.text(x, y - 1.7 * TICK, label, va="top", ha="center")
+                self._number(x, y - 1.7 * self.tick, label, va="top", ha="center")
 
-    def ticks_beside(self, *, labelled: bool = True, right: bool = False) -> None:
-        """Round numbers along the left edge, or the right one."""
-        values, labels = round_ticks(*self.y)
-        out = TICK if right else -TICK
+    def ticks_beside(
+        self,
+        *,
+        labelled: bool = True,
+        right: bool = False,
+        given: tuple[Floats, list[str]] | None = None,
+    ) -> float:
+        """Round numbers along the left edge, or the right one, or values with these labels.
+
+        Returns about where the longest of them ends.
+        """
+        values, labels = given or round_ticks(*self.y, max(5, int(self.box[3] / TICKED)))
+        few = slice(None, None, 1 + int(len(labels) * self.size / (60.0 * self.box[3])))
+        values, labels = values[few], labels[few]
+        out = self.tick if right else -self.tick
         for (x, y), label in zip(self.at(self.x[right], values), labels, strict=True):
             self.ticks.append(np.array([(x, y), (x + out, y)]))
             if labelled:
-                self.sheet.text(
-                    x + 1.7 * out, y, label, ha="left" if right else "right", va="center"
-                )
+                side = "left" if right else "right"
+                self._number(x + 1.7 * out, y, label, ha=side, va="center")
+        longest = max((len(label) for label in labels), default=0) * CHARACTER * self.size / SMALL
+        edge = self.box[0] + self.box[2] * right
+        return edge + 1.7 * out + (longest if right else -longest)
+
+    def _number(self, x: float, y: float, text: str, **look: Any) -> None:
+        self.sheet.text(x, y, text, fontsize=self.size, **look)
+
+    def label_above(self, text: str, **look: Any) -> None:
+        """What the panel shows."""
+        left, bottom, width, height = self.box
+        self.sheet.text(left + 0.5 * width, bottom + height + 0.1, text, ha="center", **look)
 
     def label_below(self, text: str, distance: float, **look: Any) -> None:
         """What is along the lower edge, this many inches below it."""

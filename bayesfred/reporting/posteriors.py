@@ -6,6 +6,7 @@ because a distortion coefficient is a few millionths. `bayesfred.reporting.html`
 one page.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,7 +18,7 @@ from bayesfred.model.parameters import Parameter
 from bayesfred.reporting.frames import FittedFrame, draw_triptych, triptych_height
 from bayesfred.reporting.labels import axis_label, math_symbol, power_of_ten, raised, scale_of
 from bayesfred.reporting.pairs import marks_of, shown_range
-from bayesfred.reporting.panels import Sheet
+from bayesfred.reporting.panels import Panel, Sheet
 from bayesfred.reporting.style import (
     ENSEMBLE_COLOURS,
     POSTERIOR_COLOUR,
@@ -29,6 +30,8 @@ __all__ = ["marginal_plot", "overview", "trace_plot"]
 MAX_TRACE_STEPS = 1_000
 RANK_BINS = 12
 COLUMNS = 6  # of histograms
+LINEAR = 3.0  # standard deviations up to which the overview's axis is linear
+CAP = 0.055  # inch, half of what ends an error bar
 
 
 def marginal_plot(
@@ -182,30 +185,64 @@ def overview(
     sd = np.where(sd > 0.0, sd, 1.0)
     kept = [k for k, p in enumerate(parameters) if truth is not None or p.letter in ("f", "g")]
     z = (mean if truth is None else mean - truth)[kept] / sd[kept]
-    upper = triptych_height(fitted)
-    height = upper + 3.3
-    fig = Figure(figsize=(19, height), dpi=100)
-    draw_triptych(fig, fitted)
-    ax = fig.add_axes((0.85 / 19, 0.75 / height, 17.95 / 19, 2.4 / height))
-    position = np.arange(len(kept))
-    for width in (1.0, 2.0):
-        ax.axhspan(-width, width, color="0.4", alpha=0.11, linewidth=0)
-    ax.axhline(0.0, color="0.3", linewidth=0.8)
-    ax.errorbar(position, z, yerr=1.0, fmt="o", color=POSTERIOR_COLOUR, capsize=4, markersize=6)
-    if truth is None:
-        ax.set_yscale("symlog", linthresh=3.0)
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.margins(y=0.12)
-        ax.set_ylabel("posterior mean / sd")
-    else:
-        limit = max(3.5, float(np.max(np.abs(z), initial=0.0)) + 1.5)
-        ax.set_ylim(-limit, limit)
-        ax.set_ylabel("(posterior mean - truth) / sd")
-    ax.set_xlim(-0.7, len(kept) - 0.3)
+    sheet = Sheet(19.0, triptych_height(fitted) + 3.3)
+    draw_triptych(sheet, fitted)
     ticks = [f"{math_symbol(parameters[k])}\n{_plain(mean[k], sd[k])}" for k in kept]
-    is_wide = len(kept) <= 32
-    ax.set_xticks(position, ticks, fontsize=8 if is_wide else 6, rotation=0 if is_wide else 60)
-    return fig
+    _deviations(sheet, z, ticks, from_truth=truth is not None)
+    return sheet.finish()
+
+
+def _deviations(sheet: Sheet, z: Floats, names: Sequence[str], *, from_truth: bool) -> None:
+    """Posterior means in standard deviations, with bands of one and two, along a sheet's foot."""
+    heights = np.stack([z - 1.0, z, z + 1.0])
+    limit = max(3.5, float(np.max(np.abs(z), initial=0.0)) + 1.5)
+    span = -limit, limit
+    if not from_truth:
+        heights = _compressed(heights)
+        low, high = np.min(heights, initial=-2.0), np.max(heights, initial=2.0)
+        span = float(1.12 * low - 0.12 * high), float(1.12 * high - 0.12 * low)
+    box = (0.85, 0.75, 17.95, 2.4)
+    panel = sheet.panel(box, (-0.7, len(z) - 0.3), span, 10.0)
+    across, one = np.array(panel.x), np.ones(2)
+    for width in (1.0, 2.0):
+        panel.band(across, -width * one, width * one, facecolors="0.4", alpha=0.11)
+    panel.mark(y=0.0, colors="0.3", linewidths=0.8)
+    at = np.arange(float(len(z)))
+    below, middle, above = (panel.at(at, height) for height in heights)
+    bars = {"colors": POSTERIOR_COLOUR, "linewidths": 1.5}
+    for ends in zip(below, above, strict=True):
+        sheet.line(np.array(ends), **bars)
+        for x, y in ends:
+            sheet.line(np.array([(x - CAP, y), (x + CAP, y)]), **bars)
+    sheet.axes.plot(*middle.T, "o", color=POSTERIOR_COLOUR, markersize=6)
+    panel.ticks_beside(given=None if from_truth else _marks(panel))
+    panel.label_beside(
+        f"{'(posterior mean − truth)' if from_truth else 'posterior mean'} / sd", 0.4, fontsize=10
+    )
+    wide = len(z) <= 32
+    for (x, y), name in zip(panel.at(at, span[0]), names, strict=True):
+        panel.ticks.append(np.array([(x, y), (x, y - panel.tick)]))
+        sheet.text(
+            x, y - 2.0 * panel.tick, name, ha="center", va="top", ma="center",
+            fontsize=8 if wide else 6, rotation=0 if wide else 60,
+        )  # fmt: skip
+
+
+def _compressed(z: Floats) -> Floats:
+    """Linear within +-3, logarithmic beyond: a decade is as high as 2.7 within."""
+    far = np.maximum(np.abs(z) / LINEAR, 1.0)
+    return np.sign(z) * (np.minimum(np.abs(z), LINEAR) + 0.9 * LINEAR * np.log10(far))
+
+
+def _marks(panel: Panel) -> tuple[Floats, list[str]]:
+    """Whole numbers near zero and powers of ten beyond, as many as there is room for."""
+    unit = panel.box[3] / (panel.y[1] - panel.y[0])  # inch
+    decades = 10.0 ** np.arange(1, 300, math.ceil(0.2 / (0.9 * LINEAR * unit)))
+    values = np.concatenate([np.arange(1.0, LINEAR + 1.0) if unit > 0.2 else [], decades])
+    values = np.concatenate([-values[::-1], [0.0], values])
+    at = _compressed(values)
+    inside = (at > panel.y[0]) & (at < panel.y[1])
+    return at[inside], [f"{value:g}".replace("-", "−") for value in values[inside]]
 
 
 def _ranks(draws: Floats) -> Floats:
