@@ -100,7 +100,7 @@ def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -
         )  # fmt: skip
     ax.set_title(
         f"displacement{scale}\nellipses (1 sd) {_times(enlarged)}",
-        loc="left", fontsize=11,
+        loc="left", fontsize=11, y=1.0,  # else all labels are measured for it
     )  # fmt: skip
 
 
@@ -125,7 +125,7 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
     ax.set_title(
         f"sources, off the model{scale}\n{far.sum()} of {len(at)} by more than "
         f"{SIGNIFICANT:.0f} sd (orange), {by_chance:.0f} by chance",
-        loc="left", fontsize=11,
+        loc="left", fontsize=11, y=1.0,  # else all labels are measured for it
     )  # fmt: skip
 
 

@@ -22,7 +22,9 @@ from bayesfred.reporting.panels import DPI, SMALL, Box, Panel, Sheet
 
 __all__ = [
     "FittedFrame",
+    "colour_bar",
     "draw_triptych",
+    "frame_panel",
     "residual_panels",
     "star_panels",
     "triptych_height",
@@ -103,7 +105,7 @@ def residual_panels(frames: Sequence[FittedFrame]) -> Figure:
         panel.label_above(f"run {k + 1}", fontsize=15)
         panel.label_beside("v / pixel", 0.62, fontsize=13)
     box = (sheet.width - 0.95, BELOW, 0.2, sheet.height - 1.1)
-    _bar(sheet, box, RESIDUALS, "residual / sigma")
+    colour_bar(sheet, box, RESIDUALS, "residual / sigma")
     return sheet.finish()
 
 
@@ -166,7 +168,7 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
         position = f"{round(u[s]):+d}, {round(v[s]):+d}".replace("-", "−")
         sheet.text(left + STAMP + 0.1, bottom + STAMP - 0.06, position, va="top", fontsize=8.5)
     box = (sheet.width - 0.65, 0.1, 0.14, sheet.height - 0.5)
-    _bar(sheet, box, RESIDUALS, "residual / sigma", sizes=(SMALL, 10.0))
+    colour_bar(sheet, box, RESIDUALS, "residual / sigma", sizes=(SMALL, 10.0))
     return sheet.finish()
 
 
@@ -211,8 +213,8 @@ def draw_triptych(sheet: Sheet, fitted: FittedFrame) -> None:
     values = _even_ticks(norm)
     ticks = np.asarray(norm(values)), [f"{value:g}" for value in values]
     bars = [(box[0] + box[2] + 0.1, box[1], 0.175, box[3]) for box in (model.box, residual.box)]
-    _bar(sheet, bars[0], (COUNTS_MAP, (0.0, 1.0)), "counts per pixel", ticks=ticks)
-    _bar(sheet, bars[1], RESIDUALS, "residual / sigma")
+    colour_bar(sheet, bars[0], (COUNTS_MAP, (0.0, 1.0)), "counts per pixel", ticks=ticks)
+    colour_bar(sheet, bars[1], RESIDUALS, "residual / sigma")
 
 
 def _show(
@@ -220,18 +222,41 @@ def _show(
 ) -> Panel:
     """A frame in a panel, green where it is not finite; unsmoothed, so that noise stays noise.
 
-    It is within `SIDE` of the left, and the height of the place is what is above the lower edge.
+    The place is given by left, bottom and height; it is as wide as `SIDE`.
     """
-    left, bottom, high = place
+    panel = frame_panel(sheet, (*place[:2], SIDE, place[2]), frame.shape, NUMBERS)
+    _, _, width, height = panel.box
     ny, nx = frame.shape
-    width, height = min(SIDE, high * nx / ny), min(high, SIDE * ny / nx)
-    box = (left + 0.5 * (SIDE - width), bottom + 0.5 * (high - height), width, height)
-    panel = sheet.panel(box, (-nx / 2, nx / 2), (-ny / 2, ny / 2), NUMBERS)
     some = np.ix_(*(_shown(n, inches) for n, inches in ((ny, height), (nx, width))))
-    sheet.image(box, _colours(colours)(norm(np.ma.masked_invalid(frame[some])), bytes=True))
+    sheet.image(panel.box, _colours(colours)(norm(np.ma.masked_invalid(frame[some])), bytes=True))
+    panel.label_below("u / pixel", 0.33, fontsize=LABELS)
+    return panel
+
+
+def frame_panel(sheet: Sheet, room: Box, shape: tuple[int, ...], size: float) -> Panel:
+    """A panel in the middle of some room, as wide and high as a frame, with numbers around it.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    room : tuple of float, inch
+        Left, bottom, width and height.
+    shape : tuple of int, (ny, nx)
+    size : float, point
+        Of the numbers.
+
+    Returns
+    -------
+    Panel
+        Its data are pixels from the middle.
+    """
+    left, bottom, wide, high = room
+    ny, nx = shape
+    width, height = min(wide, high * nx / ny), min(high, wide * ny / nx)
+    box = (left + 0.5 * (wide - width), bottom + 0.5 * (high - height), width, height)
+    panel = sheet.panel(box, (-nx / 2, nx / 2), (-ny / 2, ny / 2), size)
     panel.ticks_below()
     panel.ticks_beside()
-    panel.label_below("u / pixel", 0.33, fontsize=LABELS)
     return panel
 
 
@@ -241,7 +266,7 @@ def _shown(number: int, inches: float) -> NDArray[np.int64]:
     return ((np.arange(most) + 0.5) * number / most).astype(np.int64)
 
 
-def _bar(
+def colour_bar(
     sheet: Sheet,
     box: Box,
     scale: tuple[str, tuple[float, float]],
@@ -250,7 +275,21 @@ def _bar(
     ticks: tuple[Floats, list[str]] | None = None,
     sizes: tuple[float, float] = (NUMBERS, LABELS),
 ) -> None:
-    """A colour bar with its label, numbers and label in these sizes."""
+    """A colour bar with its label.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    box : tuple of float, inch
+        Left, bottom, width and height.
+    scale : tuple of str and (float, float)
+        Name of the colours, and the values at their ends.
+    label : str
+    ticks : tuple of ndarray and list of str, optional
+        Values and their labels; round numbers if not given.
+    sizes : tuple of float, point
+        Of numbers and label.
+    """
     colours, span = scale
     sheet.image(box, colormaps[colours](np.linspace(0.0, 1.0, 256)[:, None], bytes=True))
     bar = sheet.panel(box, (0.0, 1.0), span, sizes[0])

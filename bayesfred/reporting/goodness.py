@@ -3,8 +3,10 @@
 `bayesfred.analysis.residuals` makes the numbers.
 """
 
+from typing import Any
+
 import numpy as np
-from matplotlib.axes import Axes
+from matplotlib import colormaps
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from scipy import stats
@@ -12,6 +14,8 @@ from scipy import stats
 from bayesfred._typing import Floats
 from bayesfred.analysis.pixel_phase import PixelPhase, harmonics
 from bayesfred.analysis.residuals import BINS, Residuals
+from bayesfred.reporting.frames import colour_bar, frame_panel
+from bayesfred.reporting.panels import Box, Panel, Sheet
 from bayesfred.reporting.style import POSTERIOR_COLOUR, TRUTH_COLOUR
 
 __all__ = ["described_residuals", "residual_panels"]
@@ -19,6 +23,8 @@ __all__ = ["described_residuals", "residual_panels"]
 LIMIT = 5.0  # standard deviations at which colours end
 BAND = 0.95
 PHASE_BINS = 8
+AXES = (("du", POSTERIOR_COLOUR, "o", -0.008), ("dv", TRUTH_COLOUR, "s", 0.008))
+SIZE = 10.0  # points, of text
 
 
 def residual_panels(residuals: Residuals, shape: tuple[int, int]) -> Figure:
@@ -34,92 +40,136 @@ def residual_panels(residuals: Residuals, shape: tuple[int, int]) -> Figure:
     -------
     Figure
     """
-    fig = Figure(figsize=(15, 4.6), dpi=100)
-    axes = fig.subplots(1, 3)
-    fig.subplots_adjust(left=0.05, right=0.93, bottom=0.12, top=0.92, wspace=0.3)
-    _draw_pit(axes[0], residuals.pit)
-    _draw_phase(axes[1], residuals.phases)
-    _draw_sources(fig, axes[2], residuals, shape)
-    return fig
+    sheet = Sheet(15.0, 4.6)
+    boxes = [(0.75 + 4.77 * k, 0.55, 3.67, 3.68) for k in range(3)]
+    _draw_pit(sheet, boxes[0], residuals.pit)
+    _draw_phase(sheet, boxes[1], residuals.phases)
+    _draw_sources(sheet, boxes[2], residuals, shape)
+    return sheet.finish()
 
 
-def _draw_pit(ax: Axes, pit: Floats | None) -> None:
+def _draw_pit(sheet: Sheet, box: Box, pit: Floats | None) -> None:
     """The histogram of the PIT over its expectation, with the band that holds 95 % of the bars."""
-    ax.set(
-        xlabel="PIT of the residual", ylabel="pixels / expected", title="Distribution", xlim=(0, 1)
-    )
     if pit is None or pit.size < BINS:
-        return _say(ax, "not tested")
-    counts, edges = np.histogram(pit, BINS, (0.0, 1.0))
-    expected = pit.size / BINS
-    low, high = stats.binom.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], pit.size, 1.0 / BINS) / expected
-    ax.axhspan(low, high, color="0.85", label=f"{BAND:.0%} of the bars of a true model")
-    ax.axhline(1.0, color="0.5", lw=0.8)
-    ax.stairs(
-        counts / expected, edges, baseline=None, color=POSTERIOR_COLOUR, lw=1.8, label="this frame"
-    )
-    far = max(np.abs(counts / expected - 1.0).max(), high - 1.0)
-    ax.set_ylim(max(1.0 - 1.3 * far, 0.0), 1.0 + 1.6 * far)
-    ax.legend(loc="upper center", fontsize=8, frameon=False)
-    return None
+        panel = sheet.panel(box, (0.0, 1.0), (0.0, 1.0), SIZE)
+        _say(panel, "not tested")
+    else:
+        counts, edges = np.histogram(pit, BINS, (0.0, 1.0))
+        bars, expected = counts * BINS / pit.size, pit.size / BINS
+        ends = [0.5 - BAND / 2, 0.5 + BAND / 2]
+        low, high = stats.binom.ppf(ends, pit.size, 1.0 / BINS) / expected
+        far = max(np.abs(bars - 1.0).max(), high - 1.0)
+        span = max(1.0 - 1.3 * far, 0.0), 1.0 + 1.6 * far
+        panel = sheet.panel(box, (0.0, 1.0), span, SIZE)
+        band = {"facecolors": "0.85"}
+        panel.band(np.array(panel.x), np.full(2, low), np.full(2, high), **band)
+        panel.mark(y=1.0, colors="0.5", linewidths=0.8)
+        look = {"colors": POSTERIOR_COLOUR, "linewidths": 1.8}
+        panel.line(np.repeat(edges, 2)[1:-1], np.repeat(bars, 2), **look)
+        _name(panel, (0.8, 0), f"{BAND:.0%} of the bars of a true model", band)
+        _name(panel, (0.8, 1), "this frame", look)
+    _around(panel, "PIT of the residual", "pixels / expected", "Distribution")
 
 
-def _draw_phase(ax: Axes, phases: tuple[PixelPhase, PixelPhase]) -> None:
+def _draw_phase(sheet: Sheet, box: Box, phases: tuple[PixelPhase, PixelPhase]) -> None:
     """Weighted means of the displacements in bins of the phase, and the two harmonics."""
-    ax.set(
-        xlabel="position within the pixel",
-        ylabel="displacement / pixel",
-        title="Pixel phase",
-        xlim=(-0.5, 0.5),
-    )
-    if not any(phase.phase.size for phase in phases):
-        return _say(ax, "no source whose place is known")
-    grid = np.linspace(-0.5, 0.5, 201)
-    ax.axhline(0.0, color="0.5", lw=0.8)
-    marks = (("du", POSTERIOR_COLOUR, "o", -0.008), ("dv", TRUTH_COLOUR, "s", 0.008))
-    for fit, (name, colour, mark, offset) in zip(phases, marks, strict=True):
-        bins = np.clip(((fit.phase + 0.5) * PHASE_BINS).astype(int), 0, PHASE_BINS - 1)
-        weight = np.bincount(bins, fit.sd**-2.0, PHASE_BINS)
-        mean = np.bincount(bins, fit.displacement * fit.sd**-2.0, PHASE_BINS)
-        some = weight > 0.0
-        place = (np.arange(PHASE_BINS)[some] + 0.5) / PHASE_BINS - 0.5 + offset
-        ax.errorbar(
-            place, mean[some] / weight[some], weight[some] ** -0.5, fmt=mark, ms=5, capsize=2,
-            color=colour, label=f"{name} along its axis",
-        )  # fmt: skip
-        if fit.dof:
-            ax.plot(grid, harmonics(grid) @ fit.coefficients, color=colour, lw=1.2)
-    ax.legend(fontsize=8, frameon=False)
-    return None
+    if not any(fit.phase.size for fit in phases):
+        panel = sheet.panel(box, (-0.5, 0.5), (0.0, 1.0), SIZE)
+        _say(panel, "no source whose place is known")
+    else:
+        means = [_by_phase(fit) for fit in phases]
+        grid = np.linspace(-0.5, 0.5, 201)
+        curves = [harmonics(grid) @ fit.coefficients for fit in phases if fit.dof]
+        values = np.concatenate(
+            [ends for _, mean, sd in means for ends in (mean - sd, mean + sd)] + curves
+        )
+        margin = 0.05 * float(np.ptp(values)) or 1.0
+        span = float(values.min()) - margin, float(values.max()) + margin
+        panel = sheet.panel(box, (-0.5, 0.5), span, SIZE)
+        panel.mark(y=0.0, colors="0.5", linewidths=0.8)
+        for k, (fit, (place, mean, sd), (name, colour, mark, offset)) in enumerate(
+            zip(phases, means, AXES, strict=True)
+        ):
+            look = {"colors": colour, "linewidths": 1.5}
+            panel.bars(place + offset, mean - sd, mean + sd, cap=0.028, **look)
+            x, y = panel.at(place + offset, mean).T
+            sheet.axes.plot(x, y, mark, color=colour, markersize=5)
+            if fit.dof:
+                panel.line(grid, harmonics(grid) @ fit.coefficients, colors=colour, linewidths=1.2)
+            x, y = _name(panel, (2.3, k), f"{name} along its axis", look)
+            sheet.axes.plot(x + 0.15, y, mark, color=colour, markersize=5)
+    _around(panel, "position within the pixel", "displacement / pixel", "Pixel phase")
 
 
-def _draw_sources(fig: Figure, ax: Axes, residuals: Residuals, shape: tuple[int, int]) -> None:
+def _by_phase(fit: PixelPhase) -> tuple[Floats, Floats, Floats]:
+    """Bins of the phase that have sources: their middle, the mean displacement and its sd."""
+    bins = np.clip(((fit.phase + 0.5) * PHASE_BINS).astype(int), 0, PHASE_BINS - 1)
+    weight = np.bincount(bins, fit.sd**-2.0, PHASE_BINS)
+    mean = np.bincount(bins, fit.displacement * fit.sd**-2.0, PHASE_BINS)
+    some = weight > 0.0
+    place = (np.arange(PHASE_BINS)[some] + 0.5) / PHASE_BINS - 0.5
+    return place, mean[some] / weight[some], 1.0 / np.sqrt(weight[some])
+
+
+def _draw_sources(sheet: Sheet, box: Box, residuals: Residuals, shape: tuple[int, int]) -> None:
     """Every source's chi-square, in standard deviations, with rings around poor fits."""
-    ny, nx = shape
+    panel = frame_panel(sheet, box, shape, SIZE)
     table = residuals.sources
-    z = np.asarray(table["chi2_z"])
-    some = np.isfinite(z)
-    order = np.flatnonzero(some)[np.argsort(np.abs(z[some]), kind="stable")]
+    u, v, z = (np.asarray(table[name]) for name in ("u", "v", "chi2_z"))
+    inside = (np.abs(u) <= panel.x[1]) & (np.abs(v) <= panel.y[1])
+    some = np.flatnonzero(np.isfinite(z) & inside)
+    order = some[np.argsort(np.abs(z[some]), kind="stable")]
     size = 12.0 + 10.0 * np.minimum(np.abs(z[order]), 2.0 * LIMIT)
-    points = ax.scatter(
-        table["u"][order], table["v"][order], c=z[order], s=size, cmap="RdBu_r",
-        norm=Normalize(-LIMIT, LIMIT), edgecolors="0.25", linewidths=0.5,
+    x, y = panel.at(u[order], v[order]).T
+    sheet.axes.scatter(
+        x, y, c=z[order], s=size, cmap="RdBu_r", norm=Normalize(-LIMIT, LIMIT),
+        edgecolors="0.25", linewidths=0.5,
     )  # fmt: skip
-    failed = np.flatnonzero(table["failed"])
-    ax.scatter(
-        table["u"][failed], table["v"][failed], s=260, facecolors="none", edgecolors="black",
+    failed = np.flatnonzero(np.asarray(table["failed"]) & inside)
+    x, y = panel.at(u[failed], v[failed]).T
+    sheet.axes.scatter(
+        x, y, s=260, facecolors="none", edgecolors="black",
         linewidths=1.3,
     )  # fmt: skip
-    bar = ax.inset_axes((1.03, 0.05, 0.04, 0.9))
-    fig.colorbar(points, cax=bar, label="chi-square: excess / sd", extend="both")
-    ax.set(
-        xlim=(-nx / 2, nx / 2), ylim=(-ny / 2, ny / 2), aspect="equal", xlabel="u / pixel",
-        ylabel="v / pixel", title="Sources (ringed: do not fit)" if failed.size else "Sources",
-    )  # fmt: skip
+    left, bottom, width, height = panel.box
+    bar = (left + 1.03 * width, bottom + 0.09 * height, 0.15, 0.82 * height)
+    scale = "RdBu_r", (-LIMIT, LIMIT)
+    colour_bar(sheet, bar, scale, "chi-square: excess / sd", sizes=(SIZE, SIZE))
+    # values beyond the scale have the colours of its ends
+    for end, way, colour in ((bar[1], -0.15, 0.0), (bar[1] + bar[3], 0.15, 1.0)):
+        across = bar[0] + bar[2] * np.array([0.0, 0.5, 1.0])
+        tip = np.stack([across, [end, end + way, end]], axis=1)
+        sheet.area(tip, facecolors=tuple(colormaps["RdBu_r"](colour)))
+        sheet.line(tip, colors="black", linewidths=0.8)
+    title = "Sources (ringed: do not fit)" if np.any(table["failed"]) else "Sources"
+    _around(panel, "u / pixel", "v / pixel", title, numbered=True)
 
 
-def _say(ax: Axes, text: str) -> None:
-    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center", color="0.35")
+def _around(panel: Panel, below: str, beside: str, above: str, *, numbered: bool = False) -> None:
+    """What stands around a panel, and its numbers unless it has them."""
+    if not numbered:
+        panel.ticks_below()
+        panel.ticks_beside()
+    panel.label_below(below, 0.28, fontsize=SIZE)
+    panel.label_beside(beside, 0.52, fontsize=SIZE)
+    panel.label_above(above, fontsize=12)
+
+
+def _name(
+    panel: Panel, place: tuple[float, int], name: str, look: dict[str, Any]
+) -> tuple[float, float]:
+    """A line of a panel's legend, this far from its left; returns where it begins."""
+    (left, row), (x, y, _, height) = place, panel.box
+    x, y = x + left, y + height - 0.15 - 0.17 * row
+    panel.sheet.sample(x, y, look)
+    panel.sheet.text(x + 0.4, y, name, va="center", fontsize=8)
+    return x, y
+
+
+def _say(panel: Panel, text: str) -> None:
+    left, bottom, width, height = panel.box
+    at = left + 0.5 * width, bottom + 0.5 * height
+    panel.sheet.text(*at, text, ha="center", va="center", color="0.35", fontsize=SIZE)
 
 
 def described_residuals(residuals: Residuals) -> str:

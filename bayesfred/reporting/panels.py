@@ -23,7 +23,7 @@ __all__ = ["Box", "Images", "Panel", "Sheet", "round_ticks"]
 
 DPI = 100
 TICK = 0.03  # inch
-TICKED = 0.8  # inch from tick to tick, where there is room for more than a few
+TICKED = 0.6  # inch from tick to tick, where there is room for more than a few
 SMALL = 8.0  # points
 CHARACTER = 0.07  # inch, of this size
 
@@ -107,14 +107,18 @@ class Sheet:
         x, y = self.width - 0.15, self.height - 0.17
         for name, look in entries[::-1]:
             self.text(x, y, name, ha="right", va="center", fontsize=9)
-            x -= 0.08 * len(name) + 0.12
-            ends = np.array([[x - 0.3, y], [x, y]])
-            if "facecolors" in look:
-                across = np.array([0.0, 0.06])
-                self.area(np.concatenate([ends - across, ends[::-1] + across]), **look)
-            else:
-                self.line(ends, **look)
-            x -= 0.55
+            x -= 0.08 * len(name) + 0.42
+            self.sample(x, y, look)
+            x -= 0.25
+
+    def sample(self, x: float, y: float, look: dict[str, Any]) -> None:
+        """A short line or area that begins at x, for a legend."""
+        ends = np.array([[x, y], [x + 0.3, y]])
+        if "facecolors" in look:
+            across = np.array([0.0, 0.06])
+            self.area(np.concatenate([ends - across, ends[::-1] + across]), **look)
+        else:
+            self.line(ends, **look)
 
     def finish(self) -> Figure:
         """The figure, with all that was asked for."""
@@ -198,6 +202,13 @@ class Panel:
         around = np.concatenate([low, high[::-1]])
         self.sheet.area(self.at(np.concatenate([x, x[::-1]]), around), **look)
 
+    def bars(self, x: Floats, low: Floats, high: Floats, *, cap: float, **look: Any) -> None:
+        """Error bars, whose ends are twice as wide as `cap`, inch."""
+        for ends in zip(self.at(x, low), self.at(x, high), strict=True):
+            self.sheet.line(np.array(ends), **look)
+            for at, height in ends:
+                self.sheet.line(np.array([(at - cap, height), (at + cap, height)]), **look)
+
     def mark(self, *, x: float | None = None, y: float | None = None, **look: Any) -> None:
         """Straight lines across the panel, of those values that it shows."""
         if x is not None and self.x[0] < x < self.x[1]:
@@ -236,7 +247,8 @@ class Panel:
             if labelled:
                 side = "left" if right else "right"
                 self._number(x + 1.7 * out, y, label, ha=side, va="center")
-        longest = max((len(label) for label in labels), default=0) * CHARACTER * self.size / SMALL
+        characters = max((len(label) + 0.4 * label.count("−") for label in labels), default=0.0)
+        longest = characters * CHARACTER * self.size / SMALL
         edge = self.box[0] + self.box[2] * right
         return edge + 1.7 * out + (longest if right else -longest)
 

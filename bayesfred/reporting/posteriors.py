@@ -31,7 +31,6 @@ MAX_TRACE_STEPS = 1_000
 RANK_BINS = 12
 COLUMNS = 6  # of histograms
 LINEAR = 3.0  # standard deviations up to which the overview's axis is linear
-CAP = 0.055  # inch, half of what ends an error bar
 
 
 def marginal_plot(
@@ -208,13 +207,9 @@ def _deviations(sheet: Sheet, z: Floats, names: Sequence[str], *, from_truth: bo
         panel.band(across, -width * one, width * one, facecolors="0.4", alpha=0.11)
     panel.mark(y=0.0, colors="0.3", linewidths=0.8)
     at = np.arange(float(len(z)))
-    below, middle, above = (panel.at(at, height) for height in heights)
-    bars = {"colors": POSTERIOR_COLOUR, "linewidths": 1.5}
-    for ends in zip(below, above, strict=True):
-        sheet.line(np.array(ends), **bars)
-        for x, y in ends:
-            sheet.line(np.array([(x - CAP, y), (x + CAP, y)]), **bars)
-    sheet.axes.plot(*middle.T, "o", color=POSTERIOR_COLOUR, markersize=6)
+    below, middle, above = heights
+    panel.bars(at, below, above, cap=0.055, colors=POSTERIOR_COLOUR, linewidths=1.5)
+    sheet.axes.plot(*panel.at(at, middle).T, "o", color=POSTERIOR_COLOUR, markersize=6)
     panel.ticks_beside(given=None if from_truth else _marks(panel))
     panel.label_beside(
         f"{'(posterior mean − truth)' if from_truth else 'posterior mean'} / sd", 0.4, fontsize=10
