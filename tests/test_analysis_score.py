@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+import bayesfred as bf
 from bayesfred.analysis import source_tests
 from bayesfred.analysis.checks import largest_deviate
 from bayesfred.analysis.diagnostics import diagnose
@@ -152,6 +153,24 @@ def test_scores_are_those_of_dense_algebra() -> None:
     assert found.covariance / np.outer(scale, scale) == pytest.approx(
         covariance / np.outer(scale, scale), abs=1e-5
     )
+
+
+@pytest.mark.parametrize("noise", [PoissonNoise(2.0), PoissonNoise(np.full((65, 65), 0.7))])
+def test_a_frame_is_shared_by_models_of_other_backgrounds(noise: PoissonNoise) -> None:
+    """A likelihood is what it is when all is made for it, also of a background that varies."""
+    sources = SourceCatalog.grid(3, 17.0, 1e3)
+    model = ForwardModel(Detector((65, 65)), sources, GaussianPSF(SIGMA), POLYNOMIAL(1))
+    counts = bf.simulate(model, np.zeros(4), 5.0, seed=2, noise=noise)
+    plain, sloped = (
+        Posterior(model, counts, noise=noise, nuisances=Nuisances(background_order=order))
+        for order in (0, 1)
+    )
+    params = np.array([1e-3, -2e-3, 1e-3, 0.0, 5.0, 0.01, -0.02])
+    own = [sloped.likelihood.gradient(params), sloped.likelihood.fisher(params)]
+    shared = replace(sloped.likelihood)
+    shared.share_frame(plain.likelihood)
+    for expected, found in zip(own, (shared.gradient(params), shared.fisher(params)), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

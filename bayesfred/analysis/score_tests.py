@@ -189,6 +189,7 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
         posterior.likelihood,
         model=model, nuisances=nuisances, parameters=table, extrapolation=None,
     )  # fmt: skip
+    likelihood.share_frame(posterior.likelihood)
     known = dict(zip(posterior.parameter_names, params, strict=True))
     names = tuple(p.name for p in table)
     values = np.array([known.get(p.name, p.neutral) for p in table])
@@ -200,7 +201,7 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
     others = [k for k, name in enumerate(names) if name not in known]
     own = [posterior.parameter_names.index(names[k]) for k in fitted]
     prior = posterior.prior_information(params)[np.ix_(own, own)]
-    pull = (posterior.gradient(params) - posterior.likelihood.gradient(params))[own]
+    pull = posterior.prior_gradient(params)[own]
 
     size = np.diag(information).copy()
     size[fitted] += np.diag(prior)

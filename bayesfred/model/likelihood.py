@@ -149,6 +149,12 @@ class FrameLikelihood:
         if same and self.nuisances.profiled == other.nuisances.profiled:
             vars(self)["_workspaces"] = other._workspaces
 
+    def share_frame(self, other: "FrameLikelihood") -> None:
+        """Use what another made of the same counts and noise: series of the noise take long."""
+        varies = self.nuisances.background_order > 0
+        everywhere = varies or other._frame.everywhere
+        vars(self)["_frame"] = other._frame._replace(varies=varies, everywhere=everywhere)
+
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
         sources, background = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
@@ -243,7 +249,8 @@ class FrameLikelihood:
     def draw_fluxes(self, rng: np.random.Generator) -> Floats:
         """Free fluxes of all sources from their prior, shape (s,), counts."""
         shape = self.nuisances.flux_shape
-        return self._flux * rng.gamma(shape, 1.0 / shape, self._flux.size)
+        flux = self.model.sources.flux
+        return flux * rng.gamma(shape, 1.0 / shape, flux.size)
 
     def simulate(
         self, params: Floats, rng: np.random.Generator, fluxes: Floats | None = None
@@ -259,7 +266,7 @@ class FrameLikelihood:
             image, or expected counts are negative.
         """
         theta, nuisances, background = self._one(params)
-        flux = nuisances.flux_scale * self._flux
+        flux = nuisances.flux_scale * self.model.sources.flux
         if self._free:
             flux = self.draw_fluxes(rng) if fluxes is None else fluxes
         ny, nx = self.model.detector.shape
@@ -364,10 +371,6 @@ class FrameLikelihood:
         return [parameter.name for parameter in self.parameters].index("model_error")
 
     @property
-    def _flux(self) -> Floats:
-        return self.model.sources.flux
-
-    @property
     def _free(self) -> Literal[True] | None:
         return True if self.nuisances.flux == "free" else None  # code for None is not compiled
 
@@ -375,13 +378,13 @@ class FrameLikelihood:
     def _faint(self) -> Flags:
         """Free fluxes for which Laplace's approximation is not enough."""
         if not self._free:
-            return np.zeros(self._flux.size, bool)
+            return np.zeros(len(self.model.sources), bool)
         return faint_fluxes(self.model, self.counts, self.mask, self.noise)
 
     @cached_property
     def _problem(self) -> Problem:
-        n = self.nuisances
-        return Problem(self._optics, self._frame, self._flux, n.flux_shape, self._faint, self._free)
+        flux, shape = self.model.sources.flux, self.nuisances.flux_shape
+        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free)
 
     @cached_property
     def _frame(self) -> Frame:

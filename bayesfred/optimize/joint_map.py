@@ -158,7 +158,9 @@ def marginalize_joint_psf(joint: JointPosterior, params: Floats) -> JointPosteri
         centre = joint.frame_params(name, params)
         for row, k in zip(slopes, order[key], strict=True):
             model = replace(likelihood.model, psf=psfs[key][k])
-            slope = replace(likelihood, model=model).gradient(centre)
+            drawn = replace(likelihood, model=model)
+            drawn.share_frame(likelihood)
+            slope = drawn.gradient(centre)
             row[: joint.n_shared] += part.matrix.T @ slope
             row[part.own] += slope[part.places]
     slopes = slopes[np.isfinite(slopes).all(axis=1)]

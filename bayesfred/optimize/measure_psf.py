@@ -215,13 +215,12 @@ def psf_message(posterior: Posterior, estimate: MapEstimate) -> str:
 
 def _gradients(posterior: Posterior, psf: MeasuredPSF, centre: Floats) -> Floats:
     """The gradient with every PSF that was drawn, shape (draws, d)."""
-    likelihood, model = posterior.likelihood, posterior.model
-    return np.array(
-        [
-            replace(likelihood, model=replace(model, psf=drawn)).gradient(centre)
-            for drawn in psf.drawn()
-        ]
-    )
+    slopes = []
+    for drawn in psf.drawn():
+        likelihood = replace(posterior.likelihood, model=replace(posterior.model, psf=drawn))
+        likelihood.share_frame(posterior.likelihood)
+        slopes.append(likelihood.gradient(centre))
+    return np.array(slopes)
 
 
 def _marginalized(
