@@ -292,6 +292,19 @@ def test_predicted_frames_are_like_the_observed_one_or_not() -> None:
     assert [check.z for check in checks] == pytest.approx([stats.norm.isf(0.5 / 31)] * 4)
 
 
+@pytest.mark.parametrize("mean", [0.0, 0.01, 5.0, 300.0, 1e5])
+def test_bounds_of_the_pit_are_those_of_poissons_distribution(mean: float) -> None:
+    """Of whole counts, of counts between them and of counts in steps; also in the tails."""
+    n = np.concatenate([np.arange(9.0), np.rint(mean * np.linspace(0.5, 2.0, 50))])
+    mu = np.full(n.shape, mean)
+    for counts, grain in ((n, 1.0), (n + 0.2, 0.5), (3.0 * n, 3.0)):
+        found = PoissonNoise().cumulative(counts, mu, mean, grain)
+        half = 0.5 * max(grain, 1.0)
+        for bound, at in zip(found, (counts - half, counts + half), strict=True):
+            np.testing.assert_allclose(bound, stats.poisson.cdf(at, mu), atol=2e-12)
+        assert np.all(found[0] >= 0.0) and np.all(found[0] <= found[1])
+
+
 # --- frames that tell little ----------------------------------------------------------------------
 
 SPARSE = {

@@ -228,7 +228,11 @@ class PoissonNoise(Noise):
                 blurred_cdf(counts + half, mean, self.read_noise),
             )
         half = 0.5 * np.maximum(grain, 1.0)
-        return poisson_cdf(counts - half, mean), poisson_cdf(counts + half, mean)
+        upto = poisson_cdf(counts + half, mean)
+        if np.all(half == 0.5) and np.all(counts == np.rint(counts)):
+            chance = np.exp(self.log_likelihood(counts, mean, background))  # takes a third
+            return np.maximum(upto - chance, 0.0), upto
+        return poisson_cdf(counts - half, mean), upto
 
     def deviance(self, counts: Floats, mean: Floats, background: float | Floats) -> Floats:
         if not self.discrete:
