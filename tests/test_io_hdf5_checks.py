@@ -285,7 +285,7 @@ def deep_groups(file: h5py.File) -> None:
 
 
 @harm(
-    "of newer schema 9, expected bayesfred chain of schema 8: read it with the version that wrote "
+    "of newer schema 10, expected bayesfred chain of schema 9: read it with the version that wrote "
     "it"
 )
 def newer_schema(file: h5py.File) -> None:
@@ -293,7 +293,7 @@ def newer_schema(file: h5py.File) -> None:
     file["ensemble_0/unheard_of"] = ["text"]
 
 
-@harm("of schema 2, expected bayesfred chain of schema 8: remake it")
+@harm("of schema 2, expected bayesfred chain of schema 9: remake it")
 def older_schema(file: h5py.File) -> None:
     file.attrs["schema"] = 2
 

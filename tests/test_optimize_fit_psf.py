@@ -346,21 +346,21 @@ def test_what_a_psf_adds_is_that_of_a_joint_fit():
     i, k, c = joint[:3, :3], joint[:3, 3:], joint[3:, 3:]
     marginal = np.linalg.inv(c - k.T @ np.linalg.inv(i) @ k)
     draws = rng.multivariate_normal(np.zeros(4), marginal, 20_000)
-    errors = PsfErrors.of(("a", "b", "c"), i, draws @ k.T)
+    errors = PsfErrors.of(("a", "b", "c"), i, np.cov(k @ draws.T))
     schur = np.linalg.inv(i - k @ np.linalg.inv(c) @ k.T)
     np.testing.assert_allclose(np.linalg.inv(i) + errors.covariance, schur, rtol=0.02, atol=2e-3)
     moved = errors.displacements(20_000, 1)
     np.testing.assert_allclose(np.cov(moved.T), errors.covariance, rtol=0.1)
     np.testing.assert_array_equal(moved, errors.displacements(20_000, 1))
     assert not np.any(moved == errors.displacements(20_000, 2))
-    scale = PsfErrors.of(("a", "b", "position_scatter"), i, draws @ k.T)
+    scale = PsfErrors.of(("a", "b", "position_scatter"), i, np.cov(k @ draws.T))
     assert not np.any(scale.covariance[2]) and np.all(np.diag(scale.covariance)[:2] > 0.0)
 
 
 def test_what_a_psf_shares_with_parameters_is_the_slope_of_their_gradient():
     """Of counts without noise, whose residuals do not change with the PSF's slopes."""
     _, _, posterior = frame_of(bf.MoffatPSF(3.0, 4.765), 3.0, side=4)
-    psf, state, drawn = find_psf(posterior, bf.find_map(posterior), 4, 1)
+    psf, state, drawn = find_psf(posterior, bf.find_map(posterior), 4, 1, 0)
     bare = posterior.with_psf(psf)
     params = bf.find_map(bare).params
     bare = replace(bare, counts=bare.expected_counts(params))
@@ -383,7 +383,7 @@ def test_what_a_psf_shares_with_parameters_is_the_slope_of_their_gradient():
 def test_volume_of_a_psf_grows_with_the_model_error_as_its_information_falls():
     """Against tr(A^-1 dA / d eps), by draws: 4,000 know the traces to some per cent."""
     _, _, posterior = frame_of(bf.MoffatPSF(3.0, 4.765), 3.0, side=4)
-    psf, state, _ = find_psf(posterior, bf.find_map(posterior), 4, 1)
+    psf, state, _ = find_psf(posterior, bf.find_map(posterior), 4, 1, 0)
     bare = posterior.with_psf(psf)
     bare = replace(bare, nuisances=replace(bare.nuisances, model_error=True))
     params = np.append(bf.find_map(posterior.with_psf(psf)).params, 0.0)

@@ -98,9 +98,9 @@ def test_a_psf_is_the_same_from_its_own_solution(photons: float, beta: float) ->
     counts = bf.simulate(model, [1e-3, 0.0], 5.0, seed=3)
     rough = bf.Posterior(replace(model, psf=bf.GaussianPSF(1.2)), counts)
     estimate = bf.find_map(rough)
-    cold, state, _ = find_psf(rough, estimate, 4, 0)
+    cold, state, _ = find_psf(rough, estimate, 4, 0, 0)
     assert bool(state.grid.wings) == (beta < 3.0)
-    warm, again, _ = find_psf(rough, estimate, 4, 0, state)
+    warm, again, _ = find_psf(rough, estimate, 4, 0, 0, state)
     assert again.grid == state.grid
     difference = warm.coefficients - cold.coefficients
     assert np.all(np.abs(difference) <= 0.1 * cold.draws.std(axis=0) + 1e-9)

@@ -160,7 +160,13 @@ def _fitted(rest: Posterior, estimate: MapEstimate) -> tuple[Posterior, MapEstim
     model = replace(
         rest.model, psf=GaussianPSF(optical), detector=replace(rest.model.detector, pixel="box")
     )
-    return measure_psf(replace(rest, model=model), estimate, oversampling=finest, degree=psf.degree)
+    return measure_psf(
+        replace(rest, model=model),
+        estimate,
+        oversampling=finest,
+        degree=psf.degree,
+        nodes=psf.nodes,
+    )
 
 
 def _draws(found: MapEstimate, random: np.random.RandomState) -> Floats:

@@ -170,7 +170,7 @@ def _with_measured_psf(
     if isinstance(psf, PSFToMeasure):
         return measure_psf(
             posterior, estimate, oversampling=psf.oversampling, degree=psf.degree,
-            model_error=run.nuisances.model_error, prior=build.priors_given(run),
+            nodes=psf.nodes, model_error=run.nuisances.model_error, prior=build.priors_given(run),
             reject_outliers=run.frame.reject_outliers,
         )  # fmt: skip
     posterior = marginalize_psf(posterior, estimate)

@@ -30,6 +30,7 @@ _KEYS = {
     "field_radius": ("BFRADIUS", "[pixel] unit of x and y in the field's terms"),
     "determined": ("BFDETERM", "numbers that the counts determined"),
     "model_error": ("BFERROR", "share of the light left unexplained"),
+    "nodes": ("BFNODES", "along each axis of the field's grid"),
 }
 _COEFFICIENTS, _DRAWS = "COEFFICIENTS", "DRAWS"
 
@@ -53,7 +54,7 @@ def write_psf(
     arrays : mapping
         `coefficients`, and `draws` or None.
     numbers : mapping
-        `oversampling`, `field_radius`, `determined`, `model_error`.
+        `oversampling`, `field_radius`, `determined`, `model_error`, `nodes`.
     overwrite : bool
         Replace a file that exists.
     run : str, optional
@@ -110,8 +111,10 @@ def read_psf(path: PathLike) -> dict[str, Any]:
             # of a file that is damaged astropy would leave the handle open
             with fits.open(io.BytesIO(path.read_bytes()), checksum=True) as file:
                 header = file[0].header
+                header.setdefault(_KEYS["nodes"][0], 0)  # of files from before there were any
                 found: dict[str, Any] = {name: float(header[key]) for name, (key, _) in
                                          _KEYS.items()}  # fmt: skip
+                found["nodes"] = int(found["nodes"])
                 found["coefficients"] = np.asarray(file[_COEFFICIENTS].data, dtype=np.float64)
                 found["draws"] = None
                 if _DRAWS in file:

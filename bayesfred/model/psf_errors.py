@@ -31,10 +31,45 @@ from scipy import linalg
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.io.serialize import serializable
 from bayesfred.model.parameters import SCALES
 
 STREAM = 0x507F  # of random numbers, beside those of a run's steps
+
+
+def covariance_of(slopes: Floats) -> Floats:
+    """The covariance of the gradients that draws of a PSF give, without those that have none.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (draws, d)
+
+    Returns
+    -------
+    ndarray, shape (d, d)
+    """
+    return np.atleast_2d(np.cov(slopes[np.isfinite(slopes).all(axis=1)].T))
+
+
+def refuse_nodes(psf: MeasuredPSF) -> None:
+    """Refuse a PSF whose draws do not hold all of its errors.
+
+    Parameters
+    ----------
+    psf : MeasuredPSF
+
+    Raises
+    ------
+    InputError
+        If it varies between nodes.
+    """
+    if psf.nodes:
+        raise InputError(
+            f"psf: got one that varies between {psf.nodes} x {psf.nodes} nodes, expected one with "
+            "a degree for several frames: with nodes only the errors of what all sources have in "
+            "common are kept; measure it with degree"
+        )
 
 
 @serializable("occam_factor")
@@ -138,18 +173,19 @@ class PsfErrors:
         cls,
         names: tuple[str, ...],
         information: Floats,
-        gradients: Floats,
+        slopes: Floats,
         absorbed: float = 0.0,
         occam: OccamFactor | None = None,
     ) -> Self:
-        """The errors that gradients of the log-posterior, one for each draw of a PSF, stand for.
+        """The errors that the slopes of the log-posterior with PSFs of their posterior stand for.
 
         Parameters
         ----------
         names : tuple of str, length d
         information : ndarray, shape (d, d)
             With the PSF fixed, I.
-        gradients : ndarray, shape (draws, d)
+        slopes : ndarray, shape (d, d)
+            Their covariance, G.
         absorbed : float
         occam : OccamFactor, optional
 
@@ -161,9 +197,10 @@ class PsfErrors:
         block = information[np.ix_(moved, moved)]
         scale = 1.0 / np.sqrt(np.diag(block))
         factor = linalg.cho_factor(block * np.outer(scale, scale))
-        every = np.zeros((len(gradients), len(names)))
-        every[:, moved] = scale * linalg.cho_solve(factor, (gradients[:, moved] * scale).T).T
-        return cls(names, np.atleast_2d(np.cov(every.T)), absorbed, occam)
+        half = scale[:, None] * linalg.cho_solve(factor, np.diag(scale))
+        covariance = np.zeros_like(information)
+        covariance[np.ix_(moved, moved)] = half @ slopes[np.ix_(moved, moved)] @ half.T
+        return cls(names, covariance, absorbed, occam)
 
     def displacements(self, n: int, seed: int) -> Floats:
         """Draws of what another PSF would add to the parameters, shape (n, d).

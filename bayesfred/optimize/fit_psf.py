@@ -21,7 +21,8 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import MeasuredPSF
-from bayesfred.imaging.psf.measured import check_choices, field_terms
+from bayesfred.imaging.psf.field import field_terms
+from bayesfred.imaging.psf.measured import check_choices
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.anderson import accelerated
@@ -34,10 +35,13 @@ from bayesfred.optimize.psf_equations import (
     field_radius,
 )
 from bayesfred.optimize.psf_levels import STRENGTH
+from bayesfred.optimize.psf_nodes import NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
 from bayesfred.optimize.psf_start import reach, starting_grid, starting_state, suited_grid
 
 TURNS = 40
+LITTLE = 0.3  # standard deviations by which a parameter may be off
+SETTLED = 0.95  # of the model error before
 CHOOSING = 8  # turns of the strengths of the prior within one
 EXACT = 4  # turns in which the model is taken to be exact, at the most
 PATIENCE = 6  # turns without a nearer place after which an information leads no more
@@ -50,7 +54,12 @@ WINGS_SEEN = 5.0  # standard deviations of light beyond the fine grid that call 
 
 
 def fit_psf(
-    posterior: Posterior, estimate: MapEstimate, *, oversampling: int = 4, degree: int = 0
+    posterior: Posterior,
+    estimate: MapEstimate,
+    *,
+    oversampling: int = 4,
+    degree: int = 0,
+    nodes: int = 0,
 ) -> MeasuredPSF:
     """Measure the PSF on all images of a frame's sources.
 
@@ -67,6 +76,10 @@ def fit_psf(
     degree : int
         Of the polynomial by which the PSF varies over the field; 0 if it does not. The variation
         has half as many knots per pixel, three per FWHM.
+    nodes : int
+        Instead of a polynomial: so many nodes along each axis of the field, between which the PSF
+        varies linearly. It takes hundreds of sources, ten or more a node, and less time than a
+        degree of 4.
 
     Returns
     -------
@@ -76,8 +89,9 @@ def fit_psf(
     Raises
     ------
     InputError
-        If `oversampling` or `degree` cannot be used, the detector bins pixels, the distortion is no
-        polynomial, too few pixels see a source, or the search does not come to an end.
+        If `oversampling`, `degree` or `nodes` cannot be used, the detector bins pixels, the
+        distortion is no polynomial, too few pixels see a source, or the search does not come to an
+        end.
 
     References
     ----------
@@ -95,7 +109,7 @@ def fit_psf(
     >>> abs(psf.sigma - math.hypot(1.2, 12**-0.5)) < 0.01  # the pixel is in it
     True
     """
-    return find_psf(posterior, estimate, oversampling, degree)[0]
+    return find_psf(posterior, estimate, oversampling, degree, nodes)[0]
 
 
 def find_psf(
@@ -103,6 +117,7 @@ def find_psf(
     estimate: MapEstimate,
     oversampling: int,
     degree: int,
+    nodes: int,
     start: PsfState | None = None,
 ) -> tuple[MeasuredPSF, PsfState, Floats]:
     """Measure the PSF as `fit_psf` does, and keep what its errors are made of.
@@ -111,7 +126,7 @@ def find_psf(
     ----------
     posterior : Posterior
     estimate : MapEstimate
-    oversampling, degree : int
+    oversampling, degree, nodes : int
     start : PsfState, optional
         The solution for nearly the same pixels.
 
@@ -121,21 +136,26 @@ def find_psf(
     state : PsfState
         Where the PSF was found.
     drawn : ndarray, shape (draws, deviations)
-        What the draws from the PSF's posterior add to the state's deviations.
+        What the draws from the PSF's posterior add to the state's deviations; none with nodes, see
+        `node_slopes`.
     """
-    check_choices(oversampling, degree)
+    check_choices(oversampling, degree, nodes)
     if posterior.model.detector.binning != 1:
         raise InputError(
             f"detector: binning: got {posterior.model.detector.binning}, expected 1: a measured "
             "PSF has one pixel in it; describe the frame in recorded pixels"
         )
     with one_blas_thread():
+        if start is not None and start.nodes is not None:
+            return _measured_at_nodes(posterior, start)
         begin = start or _start(posterior, estimate, float(oversampling), degree)
         equations = solved(posterior, begin)
         if not equations.state.grid.wings:
             wider = _with_wings(posterior, equations.state)
             if _light_beyond(posterior, wider) > WINGS_SEEN:
                 equations = solved(posterior, wider)
+        if nodes:
+            return _measured_at_nodes(posterior, equations.state.with_nodes(nodes))
         return _measured(posterior, equations)
 
 
@@ -303,3 +323,40 @@ def _measured(
         determined=float(equations.determined().sum()),
     )
     return psf, state, drawn
+
+
+def _measured_at_nodes(
+    posterior: Posterior, state: PsfState
+) -> tuple[MeasuredPSF, PsfState, Floats]:
+    """The PSF that varies between nodes, its state, and no draws: the nodes' errors are theirs."""
+    nodes, error = state.nodes, math.inf
+    assert nodes is not None, "the PSF varies between them"
+    for _ in range(TURNS):
+        equations = NodeEquations.of(posterior, state)
+        nodes, change, far = equations.solved(nodes)
+        error, before = equations.model_error, error
+        if far < LITTLE and error >= SETTLED * before:
+            break
+        every = np.concatenate([np.zeros_like(state.deviations), change])
+        state = _moved(posterior, replace(state, nodes=nodes), every)
+    else:
+        raise InputError(
+            f"psf: no PSF found in {TURNS} turns between {nodes.number} x {nodes.number} nodes: "
+            "expected sources at most of them: set fewer nodes"
+        )
+    state = replace(state, nodes=nodes)
+    every = state.grid.combined(state.coefficients, nodes.coefficients)
+    common = np.tensordot(equations.share, every[1:], 1)
+    every[0] += common
+    every[1:] -= common
+    drawn = state.grid.combined(state.coefficients, equations.draws(nodes.strength, DRAWS))[1:]
+    psf = MeasuredPSF(
+        every,
+        state.grid.oversampling,
+        field_radius(posterior, nodes.number),
+        nodes=nodes.number,
+        draws=(every[0] + drawn)[:, None],
+        model_error=error,
+        determined=nodes.determined,
+    )
+    return psf, state, np.zeros((0, state.deviations.size))

@@ -22,7 +22,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
-from bayesfred.model.psf_errors import PsfErrors
+from bayesfred.model.psf_errors import PsfErrors, covariance_of, refuse_nodes
 from bayesfred.optimize.determined import require_light, undetermined
 from bayesfred.optimize.estimate import inverse
 from bayesfred.optimize.modes import find_modes
@@ -143,6 +143,7 @@ def marginalize_joint_psf(joint: JointPosterior, params: Floats) -> JointPosteri
     for frame in joint.frames.values():
         psf = frame.model.psf
         if isinstance(psf, MeasuredPSF) and psf.draws is not None:
+            refuse_nodes(psf)
             psfs.setdefault(id(psf), list(psf.drawn()))
     if not psfs:
         return joint
@@ -163,8 +164,8 @@ def marginalize_joint_psf(joint: JointPosterior, params: Floats) -> JointPosteri
             slope = drawn.gradient(centre)
             row[: joint.n_shared] += part.matrix.T @ slope
             row[part.own] += slope[part.places]
-    slopes = slopes[np.isfinite(slopes).all(axis=1)]
-    errors = PsfErrors.of(joint.parameter_names, joint.information(params), slopes, absorbed)
+    information, covariance = joint.information(params), covariance_of(slopes)
+    errors = PsfErrors.of(joint.parameter_names, information, covariance, absorbed)
     return replace(joint, psf_errors=errors)
 
 

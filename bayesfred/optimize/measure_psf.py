@@ -10,18 +10,18 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import FWHM, MeasuredPSF
 from bayesfred.model.posterior import Posterior
-from bayesfred.model.psf_errors import OccamFactor, PsfErrors
+from bayesfred.model.psf_errors import OccamFactor, PsfErrors, covariance_of, refuse_nodes
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import reject_once
-from bayesfred.optimize.psf_marginal import occam_factor, shared_information
+from bayesfred.optimize.psf_equations import LARGEST_ERROR
+from bayesfred.optimize.psf_marginal import node_slopes, occam_factor, shared_information
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
 FEW = 0.05  # of the sources, which may be lost so
-LARGEST_ERROR = 0.1  # where the search for a model error begins: with more, misfits grow
 
 
 def measure_psf(
@@ -30,6 +30,7 @@ def measure_psf(
     *,
     oversampling: int = 4,
     degree: int = 0,
+    nodes: int = 0,
     model_error: bool = False,
     prior: Mapping[str, Any] | None = None,
     reject_outliers: bool = False,
@@ -41,7 +42,7 @@ def measure_psf(
     posterior : Posterior
     estimate : MapEstimate
         Its maximum.
-    oversampling, degree : int
+    oversampling, degree, nodes : int
         As for `fit_psf`.
     model_error : bool
         Add the model error to the parameters: what the measured PSF leaves. With a PSF that is not
@@ -80,7 +81,7 @@ def measure_psf(
     (False, True)
     """
     given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
-    psf, state, drawn = find_psf(posterior, estimate, oversampling, degree)
+    psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes)
     bare, top = _near(posterior, estimate, psf, model_error, given)
     # single sharp pixels hide no others
     rounds = ROUNDS if bare.nuisances.model_error else 1
@@ -89,12 +90,14 @@ def measure_psf(
         if np.array_equal(kept, posterior.mask):
             break
         posterior = replace(posterior, mask=kept, extrapolation=None)
-        psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, state)
+        psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, state)
         bare, top = _near(posterior, estimate, psf, model_error, given)
-    if bare.model.optics().translates:
-        slopes = drawn @ shared_information(bare, state, top.params)
+    if nodes:
+        slopes = node_slopes(bare, state, top.params)
+    elif bare.model.optics().translates:
+        slopes = covariance_of(drawn @ shared_information(bare, state, top.params))
     else:
-        slopes = _gradients(bare, psf, top.params)
+        slopes = _slopes(bare, psf, top.params)
     occam = occam_factor(bare, state, top.params) if bare.nuisances.model_error else None
     measured = _marginalized(bare, slopes, top.params, psf.determined, occam)
     found = find_map(measured, top.params)
@@ -159,7 +162,7 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
     Raises
     ------
     InputError
-        If the PSF was not measured, or has no draws.
+        If the PSF was not measured, or has no draws; or if it varies between nodes.
 
     Examples
     --------
@@ -181,8 +184,9 @@ def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:
             f"psf: got {type(psf).__name__} without draws, expected a MeasuredPSF with its errors: "
             "fit_psf makes one"
         )
+    refuse_nodes(psf)
     bare = replace(posterior, psf_errors=None)
-    return _marginalized(bare, _gradients(bare, psf, estimate.params), estimate.params, 0.0)
+    return _marginalized(bare, _slopes(bare, psf, estimate.params), estimate.params, 0.0)
 
 
 def psf_message(posterior: Posterior, estimate: MapEstimate) -> str:
@@ -203,7 +207,7 @@ def psf_message(posterior: Posterior, estimate: MapEstimate) -> str:
     assert isinstance(psf, MeasuredPSF), "one was measured"
     errors = posterior.psf_errors
     here = "" if errors is None or errors.absorbed else " on another frame"
-    varies = f", varying with degree {psf.degree} over the field" if psf.degree else ""
+    varies = f", {psf.variation} over the field" if psf.varies else ""
     known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
     error = known.get("model_error", psf.model_error)
     left = f", {error:.1%} of the light unexplained" if error else ""
@@ -213,14 +217,14 @@ def psf_message(posterior: Posterior, estimate: MapEstimate) -> str:
     )
 
 
-def _gradients(posterior: Posterior, psf: MeasuredPSF, centre: Floats) -> Floats:
-    """The gradient with every PSF that was drawn, shape (draws, d)."""
+def _slopes(posterior: Posterior, psf: MeasuredPSF, centre: Floats) -> Floats:
+    """The covariance of the gradients with the PSFs that were drawn, shape (d, d)."""
     slopes = []
     for drawn in psf.drawn():
         likelihood = replace(posterior.likelihood, model=replace(posterior.model, psf=drawn))
         likelihood.share_frame(posterior.likelihood)
         slopes.append(likelihood.gradient(centre))
-    return np.array(slopes)
+    return covariance_of(np.array(slopes))
 
 
 def _marginalized(
@@ -230,7 +234,6 @@ def _marginalized(
     absorbed: float,
     occam: OccamFactor | None = None,
 ) -> Posterior:
-    slopes = slopes[np.isfinite(slopes).all(axis=1)]
     information = posterior.information(centre)
     errors = PsfErrors.of(posterior.parameter_names, information, slopes, absorbed, occam)
     return replace(posterior, psf_errors=errors)

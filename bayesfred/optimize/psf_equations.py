@@ -18,14 +18,15 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
-from bayesfred._typing import Floats, Ints
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.errors import InputError
-from bayesfred.imaging.psf.measured import field_terms
+from bayesfred.imaging.psf.field import field_terms
 from bayesfred.model import priors
+from bayesfred.model.kernels.psf_grids import EDGE, add_spline
 from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.anderson import accelerated
-from bayesfred.optimize.psf_levels import LIMITS, PsfGrid
+from bayesfred.optimize.psf_levels import LIMITS, STRENGTH, PsfGrid, PsfNodes
 from bayesfred.optimize.psf_samples import (
     OUTLYING,
     PsfSamples,
@@ -43,6 +44,7 @@ FASTEST = 3.4  # logarithm of the factor by which a strength may change in a tur
 SECANTS = 6  # turns that accelerate the next
 RATES = (0.5, 5.0)  # times the evidence's own change that a strength goes
 LEAST_DETERMINED = 1e-2  # coefficients of a block
+LARGEST_ERROR = 0.1  # that weights know of: with more, what surrounds a source tells its flux
 SCATTER, WIDTH = "position_scatter", "psf_sigma"
 HELD = (SCATTER, WIDTH, "model_error")  # parameters that are not solved for here
 
@@ -61,6 +63,7 @@ class PsfState:
     params : ndarray, shape (d,)
     fluxes : ndarray, shape (s,), counts
     shifts : ndarray, shape (s, 2), pixel
+    nodes : PsfNodes or None
     """
 
     grid: PsfGrid
@@ -69,6 +72,7 @@ class PsfState:
     params: Floats
     fluxes: Floats
     shifts: Floats
+    nodes: PsfNodes | None = None
 
     @property
     def deviations(self) -> Floats:
@@ -78,6 +82,11 @@ class PsfState:
     def deviating(self, deviations: Floats) -> Floats:
         """All coefficients, with other deviations from the start."""
         return np.concatenate([self.coefficients[: self.grid.fixed], deviations])
+
+    def with_nodes(self, number: int) -> "PsfState":
+        """The state with so many nodes along each axis, at which nothing deviates yet."""
+        side = self.grid.at_nodes[0]
+        return replace(self, nodes=PsfNodes(np.zeros((number**2, side, side)), STRENGTH, 0.0))
 
 
 class Pixels(NamedTuple):
@@ -136,16 +145,12 @@ class PsfInformation:
         np.add(half, half.T, out=joint[:size, :size])
         joint[size:, :size] = (coupling.T @ columns + offset @ select).T
         joint[size:, size:] = inner
-        free = np.zeros((len(state.fluxes), 3), bool)
-        free[:, 0] = posterior.nuisances.flux == "free"
-        free[:, 1:] = posterior.nuisances.position_scatter
-        light = np.bincount(data.samples.source, pixels.templates[0], len(free))
-        free[light < SEEN] = False  # wings alone would make of noise any flux
+        free, precisions = free_templates(posterior, state, pixels)
         which = np.flatnonzero(free.ravel() & (own.diagonal() > 0.0))
         if not which.size:
             none = np.zeros((0, len(joint)))
             return cls(joint, which, none, none, np.copy)
-        precision = _shift_precision(posterior, state)[which]
+        precision = precisions.ravel()[which]
         solve = splu((own[which][:, which] + sparse.diags_array(precision)).tocsc()).solve
         shared = own[which] @ columns + with_background[which] @ select
         outer = np.concatenate([coupling[which], shared], axis=1)
@@ -203,7 +208,7 @@ class PsfEquations:
         inner += [priors.slope(prior, x)[0] for prior, x in given]
         inner[[name in HELD for name in posterior.parameter_names]] = 0.0
         shifts = np.column_stack([state.fluxes, state.shifts]).ravel()
-        own -= _shift_precision(posterior, state) * shifts
+        own -= free_templates(posterior, state, pixels)[1].ravel() * shifts
         step = information.solve(own[information.which])
         pull = np.concatenate([psf, inner]) - step @ information.outer
         out = cls(state, information, pull, step, pixels.model_error)
@@ -319,9 +324,17 @@ class PsfEquations:
         return out
 
 
-def field_radius(posterior: Posterior) -> float:
-    """Half the frame's diagonal, pixel."""
-    return 0.5 * math.hypot(*posterior.model.detector.fine_shape)
+def field_radius(posterior: Posterior, nodes: int = 0) -> float:
+    """Half the frame's diagonal, or half its longer side for nodes; pixel."""
+    shape = posterior.model.detector.fine_shape
+    return 0.5 * (max(shape) if nodes else math.hypot(*shape))
+
+
+def node_weights(posterior: Posterior, nodes: int) -> sparse.csr_array:
+    """What the nodes, so many along each axis, count for every source, shape (s, nodes)."""
+    s = posterior.model.sources
+    terms = field_terms(s.x, s.y, 0, field_radius(posterior, nodes), nodes)
+    return sparse.csr_array(terms[:, 1:])
 
 
 def observed(
@@ -341,12 +354,16 @@ def observed(
         )
     terms = field_terms(sources.x, sources.y, grid.degree, field_radius(posterior))
     p = sample_psf(grid.levels, terms, data.samples, state.coefficients)
+    if state.nodes is not None:
+        own = state.nodes.splines(node_weights(posterior, state.nodes.number))
+        own = np.pad(own, [(0, 0), (EDGE, EDGE), (EDGE, EDGE)])
+        add_spline(own, 2.0 / grid.oversampling, data.samples, p)
     bright = fluxes[data.samples.source]
     templates = data.samples.size * np.stack([p[0], -bright * p[1], -bright * p[2]])
     light = data.image(bright * templates[0])
     residual, variance = data.residual(posterior, state.params, light)
     error = likely_error(residual, variance, light) if error is None else error
-    variance = variance + (error * light) ** 2
+    variance = variance + (min(error, LARGEST_ERROR) * light) ** 2
     weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * outlying**2)))
     return Pixels(data, terms, templates, weight, weight * residual, error)
 
@@ -358,9 +375,17 @@ def _acting(posterior: Posterior, state: PsfState) -> tuple[Floats, Floats]:
     return columns, np.eye(posterior.n_parameters)[levels]
 
 
-def _shift_precision(posterior: Posterior, state: PsfState) -> Floats:
-    """The prior's, of every template: 0 of fluxes."""
-    out = np.zeros((len(state.fluxes), 3))
+def free_templates(posterior: Posterior, state: PsfState, pixels: Pixels) -> tuple[Flags, Floats]:
+    """Of every source's flux and shifts, shape (s, 3): whether they are free, and their precision.
+
+    The precision is the prior's: 0 of fluxes.
+    """
+    free = np.zeros((len(state.fluxes), 3), bool)
+    free[:, 0] = posterior.nuisances.flux == "free"
+    free[:, 1:] = posterior.nuisances.position_scatter
+    light = np.bincount(pixels.data.samples.source, pixels.templates[0], len(free))
+    free[light < SEEN] = False  # wings alone would make of noise any flux
+    precision = np.zeros(free.shape)
     if posterior.nuisances.position_scatter:
-        out[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
-    return out.ravel()
+        precision[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
+    return free, precision

@@ -16,7 +16,8 @@ differences that the counts determine (D. MacKay, "Bayesian interpolation", Neur
 (1992), Eq. 4.11).
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ import numpy as np
 from scipy import sparse
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.psf.measured import field_powers
+from bayesfred.imaging.psf.field import field_powers
 from bayesfred.model.kernels.psf_normal import Levels, halved
 
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
@@ -38,6 +39,35 @@ class PsfBlock(NamedTuple):
     where: slice
     roughness: sparse.csr_array  # to be multiplied by the strength
     amplitude: Floats  # a diagonal
+
+
+@dataclass(frozen=True, eq=False)
+class PsfNodes:
+    """Deviations at the nodes of a grid over the field, on a grid twice as coarse as the fine one.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (nodes, side, side), per square pixel
+    strength : float
+        Of the prior.
+    determined : float
+        How many numbers the counts determine.
+    """
+
+    coefficients: Floats
+    strength: float
+    determined: float
+
+    @property
+    def number(self) -> int:
+        """Of nodes along each axis of the field."""
+        return math.isqrt(len(self.coefficients))
+
+    def splines(self, weights: sparse.csr_array) -> Floats:
+        """The coefficients of sources, given the nodes' weights, shape (s, side, side)."""
+        side = self.coefficients.shape[1]
+        every = weights @ self.coefficients.reshape(weights.shape[1], -1)
+        return np.asarray(every).reshape(-1, side, side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +176,20 @@ class PsfGrid:
                 out[3 * term : 3 * term + 3, every] = rows.reshape(3, -1) * h**2
         return out
 
-    def combined(self, coefficients: Floats) -> Floats:
-        """All grids' coefficients as those of one fine grid, shape (terms, n, n)."""
+    @cached_property
+    def at_nodes(self) -> tuple[int, PsfBlock, Floats]:
+        """A grid for what varies: knots a side, a term's prior and its conventions, a row each."""
+        one = replace(self, degree=1, wings=0.0)
+        first, side = 2, int(one.levels.side[-1])
+        block = one.blocks[-first]
+        rows = one.conventions[3 : 3 * first, one.fixed :][:, block.where]
+        return side, block, rows
+
+    def combined(self, coefficients: Floats, nodes: Floats | None = None) -> Floats:
+        """All grids' coefficients as those of one fine grid, shape (terms, n, n).
+
+        The terms of nodes follow, if these have coefficients, shape (nodes, side, side).
+        """
         levels, parts = self.levels, []
         for k, side in enumerate(levels.side):
             terms = int(levels.high[k] - levels.low[k])
@@ -158,8 +200,13 @@ class PsfGrid:
                 finer = halved(part.shape[1])
                 part = finer @ part @ finer.T
             parts.append((int(levels.low[k]), part))
+        terms = len(field_powers(self.degree))
+        if nodes is not None:
+            finer = halved(nodes.shape[1])
+            parts.append((terms, finer @ nodes @ finer.T))
+            terms += len(nodes)
         n = max(part.shape[1] for _, part in parts)
-        out = np.zeros((len(field_powers(self.degree)), n, n))
+        out = np.zeros((terms, n, n))
         for low, part in parts:
             edge = (n - part.shape[1]) // 2
             out[low : low + len(part), edge : n - edge, edge : n - edge] += part

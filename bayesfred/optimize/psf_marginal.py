@@ -14,7 +14,9 @@ from scipy.optimize import nnls
 from bayesfred._typing import Floats
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import OccamFactor
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.psf_equations import PsfEquations, PsfInformation, PsfState, observed
+from bayesfred.optimize.psf_nodes import NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
 
 ERRORS = (0.5, 1.0, 2.0, 4.0)  # times the model error, at which the volume is computed
@@ -41,15 +43,38 @@ def shared_information(posterior: Posterior, state: PsfState, params: Floats) ->
     -------
     ndarray, shape (deviations, d)
     """
-    known = dict(zip(posterior.parameter_names, params, strict=True))
     # what the equations of a PSF leave out in the corners of the grids is part of the PSF
     levels = state.grid.levels
     corner = math.sqrt(0.5) * float(np.max((levels.side + 4) * levels.spacing))
     state = _at(posterior, state, params)
     data = PsfSamples.at(posterior, params, state.shifts, corner)
-    found = _information(posterior, state, data, known.get("model_error", 0.0))
+    found = _information(posterior, state, data, _model_error(posterior, params))
     size = state.deviations.size
     return np.asarray(found.matrix[size:, :size].T)
+
+
+def node_slopes(posterior: Posterior, state: PsfState, params: Floats) -> Floats:
+    """The covariance of the slopes that a PSF's errors at its nodes give a log-posterior.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With the PSF.
+    state : PsfState
+        Where the PSF was found, with nodes.
+    params : ndarray, shape (d,)
+        Maximum of the posterior.
+
+    Returns
+    -------
+    ndarray, shape (d, d)
+    """
+    nodes = state.nodes
+    assert nodes is not None, "the PSF varies between them"
+    state = _at(posterior, state, params)
+    with one_blas_thread():
+        equations = _at_nodes(posterior, state, _model_error(posterior, params))
+        return equations.covariance_of_slopes(nodes.strength)
 
 
 def occam_factor(posterior: Posterior, state: PsfState, params: Floats) -> OccamFactor:
@@ -72,7 +97,8 @@ def occam_factor(posterior: Posterior, state: PsfState, params: Floats) -> Occam
     state = _at(posterior, state, params)
     data = PsfSamples.at(posterior, params, state.shifts, state.grid.radius)
     errors = error * np.array([0.0, *ERRORS])
-    volumes = np.array([_log_volume(posterior, state, data, each) for each in errors])
+    with one_blas_thread():
+        volumes = np.array([_log_volume(posterior, state, data, each) for each in errors])
     scales = error * SCALES
     terms = 0.5 * np.log1p((errors[1:, None] / scales) ** 2)
     return OccamFactor(nnls(terms, volumes[1:] - volumes[0])[0], scales)
@@ -82,6 +108,15 @@ def _at(posterior: Posterior, state: PsfState, params: Floats) -> PsfState:
     """The state with a posterior's parameters, and the fluxes and shifts that go with them."""
     _, _, fluxes, shifts = posterior.likelihood.own_pixels(params, state.grid.radius)
     return replace(state, params=params, fluxes=fluxes, shifts=shifts)
+
+
+def _model_error(posterior: Posterior, params: Floats) -> float:
+    known = dict(zip(posterior.parameter_names, params, strict=True))
+    return float(known.get("model_error", 0.0))
+
+
+def _at_nodes(posterior: Posterior, state: PsfState, error: float) -> NodeEquations:
+    return NodeEquations.of(posterior, state, error, math.inf)
 
 
 def _information(
@@ -94,10 +129,14 @@ def _information(
 def _log_volume(posterior: Posterior, state: PsfState, data: PsfSamples, error: float) -> float:
     """Of the PSF's posterior, the other parameters following, up to a constant.
 
+    With nodes it is theirs, nearly.
+
     The posterior of those is that with the PSF fixed: their own information is divided out. R being
     the conventions' rows and A the information without them, the determinant within the conventions
     is det A det(R A^-1 R^T) / det(R R^T).
     """
+    if state.nodes is not None:
+        return _at_nodes(posterior, state, error).log_volume(state.nodes.strength)
     information = _information(posterior, state, data, error)
     size = len(information.matrix)
     equations = PsfEquations(state, information, np.zeros(size), np.zeros(0), error)

@@ -36,7 +36,7 @@ def psf_panels(psf: MeasuredPSF, shape: tuple[int, int]) -> Figure:
     a = _axis(psf)
     _draw_image(fig, axes[0], psf, a)
     _draw_profile(axes[1], psf)
-    if psf.degree:
+    if psf.varies:
         _draw_variation(fig, axes[2], psf, shape, a)
     else:
         _draw_difference(fig, axes[2], psf, a)
@@ -144,8 +144,7 @@ def described_psf(psf: MeasuredPSF) -> str:
     'A PSF with a FWHM of 2.37 pixels, the same all over the field. It differs from the Gaussian...'
     """
     far = np.abs(_less_gaussian(psf, _axis(psf))).max()
-    field = f"varying with degree {psf.degree} over" if psf.degree else "the same all over"
     return (
-        f"A PSF with a FWHM of {FWHM * psf.sigma:.2f} pixels, {field} the field. It differs from "
-        f"the Gaussian of its FWHM and peak by at most {far:.1%} of its peak."
+        f"A PSF with a FWHM of {FWHM * psf.sigma:.2f} pixels, {psf.variation} over the field. It "
+        f"differs from the Gaussian of its FWHM and peak by at most {far:.1%} of its peak."
     )

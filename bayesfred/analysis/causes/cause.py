@@ -7,6 +7,9 @@ from bayesfred.model.posterior import Posterior
 
 RICHER = 0.9  # weight of a hypothesis that contains others
 
+MOST = 4  # a degree, beyond which the equations of a PSF take minutes
+NODES = 7
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -69,4 +72,10 @@ def psf_remedy(posterior: Posterior, other: str) -> str:
     psf = posterior.model.psf
     if not isinstance(psf, MeasuredPSF):
         return other
-    return f"let the PSF vary more over the field (psf.degree = {psf.degree + 2})"
+    if psf.nodes:
+        more = f"psf.nodes = {psf.nodes + 4}"
+    elif psf.degree < MOST:
+        more = f"psf.degree = {psf.degree + 2}"
+    else:
+        more = f"psf.nodes = {NODES} in place of psf.degree"
+    return f"let the PSF vary more over the field ({more})"

@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
+from bayesfred.imaging.psf.field import field_powers, field_terms
 from bayesfred.imaging.psf.gaussian import GaussianPSF
 from bayesfred.imaging.psf.sampled import (
     MARGIN,
@@ -26,47 +27,6 @@ NORMALISED = 1e-9
 CELLS = 201  # a side, by which the area above half the peak is counted
 
 
-def field_powers(degree: int) -> tuple[tuple[int, int], ...]:
-    """Powers of x and y of a polynomial's terms, the constant first.
-
-    Parameters
-    ----------
-    degree : int
-
-    Returns
-    -------
-    tuple of (int, int)
-
-    Examples
-    --------
-    >>> field_powers(1)
-    ((0, 0), (1, 0), (0, 1))
-    """
-    return tuple((k - j, j) for k in range(degree + 1) for j in range(k + 1))
-
-
-def field_terms(x: npt.ArrayLike, y: npt.ArrayLike, degree: int, radius: float) -> Floats:
-    """The terms (x / radius)^i (y / radius)^j of a polynomial over the field.
-
-    Parameters
-    ----------
-    x, y : array_like, shape (n,), pixel
-    degree : int
-    radius : float, pixel
-
-    Returns
-    -------
-    ndarray, shape (n, terms)
-
-    Examples
-    --------
-    >>> field_terms([20.0], [-5.0], 1, 10.0).tolist()
-    [[1.0, 2.0, -0.5]]
-    """
-    s, t = np.asarray(x, dtype=float) / radius, np.asarray(y, dtype=float) / radius
-    return np.stack([s**i * t**j for i, j in field_powers(degree)], axis=-1)
-
-
 @serializable("measured_psf")
 @dataclass(frozen=True, eq=False)
 class MeasuredPSF:
@@ -78,20 +38,25 @@ class MeasuredPSF:
 
         p(a, b; x, y) = sum_t (x / r)^i (y / r)^j sum_kl c[t, l, k] B(a h - k) B(b h - l)
 
-    with h samples per pixel and r the field's radius. Its constant term has unit volume, and the
-    others have none, so it changes no flux. Weighted by the Gaussian of the same width its centroid
-    is zero everywhere on the field, so it moves no source: what moves sources is the distortion.
+    with h samples per pixel and r the field's radius. Or it varies linearly between the nodes of a
+    grid: then the further terms are the nodes' own (`field_terms`). Its constant term has unit
+    volume, and the others have none, so it changes no flux. Weighted by the Gaussian of the same
+    width its centroid is zero everywhere on the field, so it moves no source: what moves sources is
+    the distortion.
 
     Parameters
     ----------
     coefficients : array_like, shape (terms, n, n), per square pixel
-        The splines' coefficients [t, b, a], n odd; the terms 1, x, y, x^2, x y, y^2, ...
+        The splines' coefficients [t, b, a], n odd; the terms 1, x, y, x^2, x y, y^2, ..., or 1 and
+        those of the nodes, row by row.
     oversampling : float
         Samples per pixel.
     field_radius : float, pixel
         Unit of x and y.
+    nodes : int
+        Along each axis of the grid; 0 if there is none.
     draws : array_like, shape (k, terms, n, n), per square pixel, optional
-        Coefficients drawn from the posterior of the PSF: its errors.
+        Coefficients drawn from the posterior of the PSF: its errors. With nodes, of the first term.
     determined : float
         How many numbers of it the counts determined.
     model_error : float
@@ -119,6 +84,7 @@ class MeasuredPSF:
     coefficients: Floats
     oversampling: float
     field_radius: float
+    nodes: int = field(default=0, kw_only=True, metadata={"since": 9})
     draws: Floats | None = field(default=None, kw_only=True)
     determined: float = field(default=0.0, kw_only=True)
     model_error: float = field(default=0.0, kw_only=True)
@@ -126,12 +92,11 @@ class MeasuredPSF:
     def __post_init__(self) -> None:
         c = np.array(self.coefficients, dtype=np.float64)
         n = c.shape[-1] if c.ndim == 3 else 0
-        degree = round((math.sqrt(1.0 + 8.0 * len(c)) - 3.0) / 2.0)
-        shape = (len(field_powers(max(degree, 0))), n, n)
-        if c.shape != shape or n % 2 == 0 or not 5 <= n <= MOST_SAMPLES:
+        terms = self.nodes**2 + 1 if self.nodes else len(field_powers(max(_degree(len(c)), 0)))
+        if c.shape != (terms, n, n) or n % 2 == 0 or not 5 <= n <= MOST_SAMPLES:
             raise InputError(
                 f"psf: coefficients: got shape {c.shape}, expected (terms, n, n) with 1, 3, 6, ... "
-                f"terms and n odd, 5 to {MOST_SAMPLES}"
+                f"terms, or one and the nodes, and n odd, 5 to {MOST_SAMPLES}"
             )
         volume = float(c[0].sum())
         if not (np.isfinite(c).all() and volume > 0.0):
@@ -145,9 +110,10 @@ class MeasuredPSF:
         if abs(scale - 1.0) < NORMALISED:  # so that what was stored is read as it was
             scale = 1.0
         draws = None if self.draws is None else np.array(self.draws, dtype=np.float64) * scale
-        if draws is not None and (draws.shape[1:] != c.shape or not np.isfinite(draws).all()):
+        drawn = (1 if self.nodes else terms, n, n)
+        if draws is not None and (draws.shape[1:] != drawn or not np.isfinite(draws).all()):
             raise InputError(
-                f"psf: draws: got shape {draws.shape}, expected (k, {', '.join(map(str, c.shape))})"
+                f"psf: draws: got shape {draws.shape}, expected (k, {', '.join(map(str, drawn))})"
                 " of finite numbers"
             )
         object.__setattr__(self, "coefficients", c * scale)
@@ -161,8 +127,21 @@ class MeasuredPSF:
 
     @property
     def degree(self) -> int:
-        """Degree of the variation over the field."""
-        return round((math.sqrt(1.0 + 8.0 * len(self.coefficients)) - 3.0) / 2.0)
+        """Degree of the polynomial by which it varies over the field."""
+        return 0 if self.nodes else _degree(len(self.coefficients))
+
+    @property
+    def varies(self) -> bool:
+        """Whether it varies over the field."""
+        return len(self.coefficients) > 1
+
+    @property
+    def variation(self) -> str:
+        """How it varies over the field, in words."""
+        if not self.varies:
+            return "the same all"
+        between = f"between {self.nodes} x {self.nodes} nodes"
+        return f"varying {between if self.nodes else f'with degree {self.degree}'}"
 
     @cached_property
     def peak(self) -> float:
@@ -196,15 +175,15 @@ class MeasuredPSF:
     def profile_of(self, x: Floats, y: Floats) -> Any:
         """The PSF of every source as the compiled loops need it."""
         one = self.profile
-        if self.degree == 0:
+        if not self.varies:
             return one
         c = np.tensordot(self.terms(x, y), self.coefficients, 1) / self.oversampling**2
         edges = [(0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)]
         return spline_profile(one.norm, np.pad(c, edges), one.scale, one.stride)
 
     def terms(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
-        """The polynomial's terms at positions on the field (pixel), shape (n, terms)."""
-        return field_terms(x, y, self.degree, self.field_radius)
+        """The field's terms at positions on it (pixel), shape (n, terms)."""
+        return field_terms(x, y, self.degree, self.field_radius, self.nodes)
 
     def support_radius(self, tolerance: float) -> float:
         """Distance from the middle beyond which p is below `tolerance` times its peak, pixel."""
@@ -258,7 +237,7 @@ class MeasuredPSF:
         image = values_at_knots(self.coefficients[0])
         numbers = {
             "oversampling": self.oversampling, "field_radius": self.field_radius,
-            "determined": self.determined, "model_error": self.model_error,
+            "determined": self.determined, "model_error": self.model_error, "nodes": self.nodes,
         }  # fmt: skip
         psf_images.write_psf(path, image, arrays, numbers, overwrite=overwrite, run=run)
 
@@ -285,7 +264,8 @@ class MeasuredPSF:
         """The PSF as a model of photutils, whose positions count from a frame's first pixel.
 
         It is sampled four times a pixel or more. One that varies over the field is sampled on a
-        grid of positions as fine as its degree asks for, between which photutils interpolates.
+        grid of positions, its nodes or as many as its degree asks for, between which photutils
+        interpolates.
 
         Parameters
         ----------
@@ -301,12 +281,12 @@ class MeasuredPSF:
         InputError
             If photutils is not installed, or the shape is missing.
         """
-        if self.degree > 0 and shape is None:
+        if self.varies and shape is None:
             raise InputError("shape: got none, expected that of the frame: the PSF varies over it")
         ny, nx = shape or (1, 1)
-        points = 2 * self.degree + 1
-        columns = np.linspace(0.0, nx - 1.0, points) if self.degree else np.zeros(1)
-        rows = np.linspace(0.0, ny - 1.0, points) if self.degree else np.zeros(1)
+        points = self.nodes or 2 * self.degree + 1
+        columns, rows = (np.linspace(0.0, n - 1.0, points) if self.varies else np.zeros(1)
+                         for n in (nx, ny))  # fmt: skip
         fine = max(4, math.ceil(self.oversampling))
         half = math.ceil(0.5 * self.coefficients.shape[-1] / self.oversampling * fine)
         x = np.arange(-half, half + 1) / fine
@@ -319,8 +299,14 @@ class MeasuredPSF:
 
     def drawn(self) -> "Iterator[MeasuredPSF]":
         """The PSFs that were drawn from its posterior, each without errors of its own."""
-        for coefficients in self.draws if self.draws is not None else ():
-            yield replace(self, coefficients=coefficients, draws=None)
+        for drawn in self.draws if self.draws is not None else ():
+            every = np.concatenate([drawn, self.coefficients[len(drawn) :]])
+            yield replace(self, coefficients=every, draws=None)
+
+
+def _degree(terms: int) -> int:
+    """Of the polynomial that has so many terms."""
+    return round((math.sqrt(1.0 + 8.0 * terms) - 3.0) / 2.0)
 
 
 @serializable("psf.measured")
@@ -332,26 +318,27 @@ class PSFToMeasure(GaussianPSF):
     ----------
     sigma : float, pixel
         About the right width, which is fitted first.
-    oversampling, degree : int
+    oversampling, degree, nodes : int
         As for `fit_psf`.
 
     Raises
     ------
     InputError
-        If `sigma` is not positive, `oversampling` is not from 1 to 16, or `degree` not from 0 to 6.
+        If `sigma` is not positive, or another cannot be used (`check_choices`).
 
     Examples
     --------
     >>> PSFToMeasure(1.3, degree=2)
-    PSFToMeasure(sigma=1.3, oversampling=4, degree=2)
+    PSFToMeasure(sigma=1.3, oversampling=4, degree=2, nodes=0)
     """
 
     oversampling: int = 4
     degree: int = 0
+    nodes: int = field(default=0, metadata={"since": 9})
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choices(self.oversampling, self.degree)
+        check_choices(self.oversampling, self.degree, self.nodes)
 
 
 @serializable("psf.file")
@@ -373,20 +360,30 @@ class PSFFile:
     path: str
 
 
-def check_choices(oversampling: int, degree: int) -> None:
-    """Refuse an oversampling or a degree with which no PSF can be measured.
+def check_choices(oversampling: int, degree: int, nodes: int) -> None:
+    """Refuse choices with which no PSF can be measured.
 
     Parameters
     ----------
-    oversampling, degree : int
+    oversampling, degree, nodes : int
 
     Raises
     ------
     InputError
-        If they are no integers from 1 to 16, and 0 to 6.
+        If they are no integers from 1 to 16, 0 to 6, and 2 to 32 or 0; or if neither the degree nor
+        the number of nodes is 0.
     """
-    for name, value, low, high in (("oversampling", oversampling, 1, 16), ("degree", degree, 0, 6)):
+    for name, value, low, high in (
+        ("oversampling", oversampling, 1, 16),
+        ("degree", degree, 0, 6),
+        ("nodes", nodes or 2, 2, 32),
+    ):
         if not isinstance(value, int | np.integer) or not low <= value <= high:
             raise InputError(
                 f"psf: {name}: got {value!r}, expected an integer from {low} to {high}"
             )
+    if degree and nodes:
+        raise InputError(
+            f"psf: got degree {degree} and nodes {nodes}, expected one of them: the PSF varies as "
+            "a polynomial or between nodes"
+        )

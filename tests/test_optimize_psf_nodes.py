@@ -1,0 +1,199 @@
+"""PSFs that vary between nodes: their equations against dense ones, and simulated frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+import bayesfred as bf
+from bayesfred.imaging.psf.spline_values import spline_coefficients
+from bayesfred.optimize import measure_psf as measuring
+from bayesfred.optimize.psf_equations import observed
+from bayesfred.optimize.psf_nodes import NodeEquations
+from bayesfred.optimize.psf_samples import PsfSamples
+from bayesfred.optimize.psf_start import starting_grid, starting_state
+
+SIGMA, SIDE, NODES = 1.4, 285, 5
+
+
+def turning_psf(half):
+    """Ellipses that turn by 45 degrees from node to node: no polynomial of low degree."""
+    x = np.arange(-32, 33) / 4.0
+    a, b = x, x[:, None]
+    round_one = np.exp(-(a**2 + b**2) / (2 * SIGMA**2)) / (2 * np.pi * SIGMA**2)
+    terms = [round_one]
+    for row in range(NODES):
+        for column in range(NODES):
+            angle = 0.25 * np.pi * (row + column)
+            p, q = a * np.cos(angle) + b * np.sin(angle), b * np.cos(angle) - a * np.sin(angle)
+            long, short = 1.25 * SIGMA, SIGMA / 1.25
+            own = np.exp(-0.5 * (p / long) ** 2 - 0.5 * (q / short) ** 2) / (2 * np.pi * SIGMA**2)
+            terms.append(own / own.sum() * round_one.sum() - round_one)
+    return bf.MeasuredPSF(np.array([spline_coefficients(t) for t in terms]), 4.0, half, nodes=NODES)
+
+
+def frame_of(seed, side=SIDE, grid=20, flux=3e4):
+    """A posterior that takes the PSF for a Gaussian, and the true parameters."""
+    terms = [(1, 0, 0, 0), (0, 1, 0, 0), (2, 0, 0, 0), (1, 1, 0, 0), (0, 2, 0, 0)]
+    distortion = bf.PolynomialDistortion(terms, terms)
+    detector = bf.Detector((side, side))
+    stars = bf.SourceCatalog.grid(grid, 13.6, flux)  # every phase of the pixels
+    rng = np.random.default_rng(seed)
+    theta = rng.normal(size=10) * np.repeat([[2e-3] * 2 + [1e-5] * 3], 2, axis=0).ravel()
+    true = bf.ForwardModel(detector, stars, turning_psf(0.5 * side), distortion)
+    counts = bf.simulate(true, theta, 20.0, seed=seed)
+    taken = bf.ForwardModel(
+        bf.Detector((side, side), pixel="box"), stars, bf.GaussianPSF(SIGMA), distortion
+    )
+    nuisances = bf.Nuisances(flux="free", offset=True, psf_sigma=True)
+    return bf.Posterior(taken, counts, nuisances=nuisances), theta
+
+
+def began(posterior, estimate):
+    grid = starting_grid(posterior, estimate, 4, 0)
+    return starting_state(posterior, estimate, grid).with_nodes(2)
+
+
+def dense(equations):
+    """The derivatives of the pixels by the nodes' coefficients, and by what is eliminated."""
+    weights, splines = equations.weights.toarray(), equations.splines.toarray()
+    sources, knots = weights.shape[0], equations.knots
+    each = splines.reshape(-1, sources, knots)
+    return np.einsum("psk,sn->pnk", each, weights).reshape(len(each), -1)
+
+
+def test_equations_agree_with_dense_ones():
+    posterior, _ = frame_of(3, side=61, grid=4)
+    state = began(posterior, bf.find_map(posterior))
+    equations = NodeEquations.of(posterior, state, 0.02)
+    design, own = dense(equations), equations.eliminated.toarray()
+    apart = own @ linalg.lstsq(own, np.column_stack([design, equations.residual]))[0]
+    design, residual = np.hsplit(np.column_stack([design, equations.residual]) - apart, [-1])
+    # the conventions by Lagrange's multipliers
+    strength, nodes = 7.0, equations.weights.shape[1]
+    matrix = design.T @ design + np.kron(np.eye(nodes), strength * equations.precision)
+    rows = np.kron(np.eye(nodes), equations.conventions)
+    system = np.block([[matrix, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
+    pull = design.T @ residual[:, 0]
+    expected = linalg.solve(system, np.append(pull, np.zeros(len(rows))))[: len(pull)]
+    found = equations.solution(strength, pull.reshape(nodes, -1), 1e-9)
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-4 * np.abs(expected).max())
+    assert np.abs(equations.conventions @ found.T).max() < 1e-12 * np.abs(found).max()
+
+
+def test_splines_are_the_derivatives_of_the_light():
+    posterior, _ = frame_of(4, side=61, grid=4)
+    state = began(posterior, bf.find_map(posterior))
+    rng, error = np.random.default_rng(1), 0.02
+    equations = NodeEquations.of(posterior, state, error)
+    change = rng.normal(size=state.nodes.coefficients.shape)
+    light = equations.splines @ (equations.weights @ change.reshape(4, -1)).ravel()
+    # by definition, pixel by pixel
+    data = PsfSamples.at(posterior, state.params, state.shifts, state.grid.radius)
+    psf = bf.MeasuredPSF(
+        state.grid.combined(state.coefficients, change), state.grid.oversampling, 30.5, nodes=2
+    )
+    bare = bf.MeasuredPSF(psf.coefficients[:1], psf.oversampling, 30.5)
+    s, samples = posterior.model.sources, data.samples
+    values = np.zeros(samples.source.size)
+    for n, k in enumerate(samples.source):
+        at = samples.a[n], samples.b[n]
+        both = [float(p.density(*at, at=(s.x[k], s.y[k]))) for p in (psf, bare)]
+        values[n] = state.fluxes[k] * samples.size[n] * (both[0] - both[1])
+    scale = float(state.grid.combined(state.coefficients)[0].sum()) / psf.oversampling**2
+    expected = data.image(values) * scale
+    expected *= np.sqrt(observed(posterior, state, data, error).weight)
+    expected = expected[np.abs(expected) > 0.0]
+    assert abs(np.sort(light[light != 0.0]) - np.sort(expected)).max() < 1e-8 * np.abs(light).max()
+
+
+def measured(seed, **variation):
+    posterior, theta = frame_of(seed)
+    posterior, estimate = bf.measure_psf(
+        posterior, bf.find_map(posterior), model_error=True, **variation
+    )
+    return posterior, estimate, theta
+
+
+@pytest.mark.slow
+def test_a_psf_that_turns_is_found_between_nodes_only():
+    """Its ellipses are in nobody's reach but the nodes'; what is left is 1 % of the light."""
+    posterior, estimate, _ = measured(1, nodes=NODES)
+    psf, true = posterior.model.psf, turning_psf(0.5 * SIDE)
+    assert estimate.fits_data
+    assert estimate.params[posterior.parameter_names.index("model_error")] < 0.02
+    a = np.linspace(-3.0, 3.0, 13)
+    for at in [(0.0, 0.0), (70.0, -70.0), (100.0, 30.0)]:
+        off = psf.density(a, a[:, None], at=at) - true.density(a, a[:, None], at=at)
+        assert np.abs(off).max() < 0.03 * true.peak
+    polynomial, rough, _ = measured(1, degree=2)
+    name = polynomial.parameter_names.index("model_error")
+    assert rough.params[name] > 0.05
+
+
+def scores(frames):
+    """Errors of the coefficients over those stated, and over those of a PSF that is known."""
+    stated, known = [], []
+    for seed in range(frames):
+        posterior, estimate, theta = measured(seed, nodes=NODES)
+        truth = dict(zip(posterior.model.distortion.names, theta, strict=True))
+        truth |= {"offset_x": 0.0, "offset_y": 0.0}
+        off = dict(zip(posterior.parameter_names, estimate.params, strict=True))
+        bare = replace(posterior, psf_errors=None)
+        for covariance, out in (
+            (estimate.covariance, stated),
+            (np.linalg.inv(bare.information(estimate.params)), known),
+        ):
+            errors = dict(zip(posterior.parameter_names, np.sqrt(np.diag(covariance)), strict=True))
+            out.append([(off[n] - truth[n]) / errors[n] for n in truth])
+    return np.array(stated), np.array(known)
+
+
+@pytest.mark.statistics
+def test_errors_hold_with_a_psf_that_varies_between_nodes():
+    """40 frames, 12 coefficients: their rms is known to 5 %, were they independent.
+
+    The control are the errors of a PSF that is taken for known.
+    """
+    stated, known = scores(40)
+    assert 0.85 < np.sqrt(np.mean(stated**2)) < 1.15
+    assert np.sqrt(np.mean(known**2)) > 1.1
+
+
+def test_files_and_choices():
+    psf = turning_psf(50.0)
+    assert (psf.degree, psf.nodes, psf.varies) == (0, NODES, True)
+    with pytest.raises(bf.InputError, match=r"coefficients: got shape \(7, 65, 65\)"):
+        bf.MeasuredPSF(psf.coefficients[:7], 4.0, 50.0, nodes=NODES)
+    with pytest.raises(bf.InputError, match="expected one of them"):
+        measuring.find_psf(None, None, 4, 2, NODES)
+    with pytest.raises(bf.InputError, match="nodes: got 1"):
+        measuring.find_psf(None, None, 4, 0, 1)
+
+
+def test_errors_on_another_frame_are_refused():
+    """The draws are of what all sources have in common: errors made of them would be too small."""
+    posterior, _ = frame_of(1, side=61, grid=4)
+    psf = turning_psf(30.5)
+    other = posterior.with_psf(replace(psf, draws=psf.coefficients[None, :1]))
+    with pytest.raises(bf.InputError, match="expected one with a degree"):
+        bf.marginalize_psf(other, None)
+
+
+def test_a_file_keeps_the_nodes(tmp_path):
+    psf = turning_psf(50.0)
+    psf.write(tmp_path / "psf.fits")
+    again = bf.MeasuredPSF.read(tmp_path / "psf.fits")
+    assert again.nodes == NODES
+    np.testing.assert_array_equal(again.coefficients, psf.coefficients)
+
+
+def test_photutils_interpolates_between_the_same_nodes():
+    pytest.importorskip("photutils.psf")
+    psf = turning_psf(50.0)
+    gridded = psf.to_photutils((101, 101))
+    gridded.x_0, gridded.y_0 = 30.0, 71.0
+    a, b = np.array([0.2, -1.1, 0.7]), np.array([-0.3, 0.4, 1.5])
+    expected = psf.density(a, b, at=(30.0 - 50.0, 71.0 - 50.0))
+    np.testing.assert_allclose(gridded(30.0 + a, 71.0 + b), expected, atol=2e-3 * psf.peak)
