@@ -180,7 +180,9 @@ class NodeEquations:
         (seen, _), (known, _) = self.coordinates
         return np.multiply.outer(seen, known)
 
-    def solution(self, strength: float, pull: Floats, precise: float = PRECISE) -> Floats:
+    def solution(
+        self, strength: float, pull: Floats, start: Floats, precise: float = PRECISE
+    ) -> Floats:
         """The coefficients that a slope leads to with a prior's strength, shape (nodes, knots).
 
         Raises
@@ -203,7 +205,8 @@ class NodeEquations:
             return scaled_slope(self._pull(self._remaining(light))) + prior * scaled
 
         operator = LinearOperator((scale.size, scale.size), matvec=product, dtype=np.float64)
-        found, left = cg(operator, scaled_slope(pull), rtol=precise, maxiter=STEPS)
+        begin = ((combinations.T @ start @ self.precision @ axes) / scale).ravel()
+        found, left = cg(operator, scaled_slope(pull), begin, rtol=precise, maxiter=STEPS)
         if left:
             raise InputError(
                 f"psf: nodes: no PSF found in {STEPS} steps: expected sources at every node: set "
@@ -229,8 +232,9 @@ class NodeEquations:
         tied = -self.known[1] / self.lengths  # the pull of what is known beside the counts
         residual = self.residual - self.eliminated @ self._own.solve(tied)
         pull, strength = self._pull(self._remaining(residual)), before.strength
+        found = before.coefficients.reshape(-1, self.knots)
         for _ in range(CHOICES):
-            found = self.solution(strength, pull)
+            found = self.solution(strength, pull, found)
             known = self.information()
             determined = float(np.sum(known / (strength + known)))
             square = float(np.sum(found * (found @ self.precision)))
@@ -284,7 +288,10 @@ class NodeEquations:
         ndarray, shape (d, d)
         """
         pulls = [self._pull(image) for image in self.parameters.T]
-        moved = [self.solution(strength, pull, ROUGH) if pull.any() else pull for pull in pulls]
+        none = np.zeros_like(pulls[0])
+        moved = [
+            self.solution(strength, pull, none, ROUGH) if pull.any() else none for pull in pulls
+        ]
         size = len(pulls)
         out = np.reshape(pulls, (size, -1)) @ np.reshape(moved, (size, -1)).T
         return np.asarray(0.5 * (out + out.T))
