@@ -19,7 +19,9 @@ from bayesfred.reporting.style import png
 RUN, OTHER = "0123456789abcdef" * 2, "f" * 32
 PAGE = b"<!DOCTYPE html>\n<html lang=en><title>run</title></html>\n"
 NAMES = ("run.html", "run.png", "run.sources.ecsv", "run.psf.fits")
-NUMBERS = {"oversampling": 4, "field_radius": 1.0, "determined": 3.0, "model_error": 0.01}
+NUMBERS = {
+    "oversampling": 4, "field_radius": 1.0, "determined": 3.0, "model_error": 0.01, "nodes": 0,
+}  # fmt: skip
 
 
 def make(folder: Path, run: str = RUN) -> list[Path]:
