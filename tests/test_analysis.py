@@ -252,6 +252,7 @@ def chain_at(params: Floats, posterior: Any, **changes: Any) -> Any:
         "accepted": np.full((4, 32), 12),
         "burn_in": 3,
         "method": "mcmc",
+        "record": None,
         "estimate": estimate,
         "posterior": lambda: posterior,
     }

@@ -119,8 +119,8 @@ def test_example_names_every_key(tmp_path: Path) -> None:
     text = text[: text.index("[joint]")]
     path.write_text(
         re.sub(
-            r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling|variance|rows|columns|pitch|layout|marks)"
-            r" = |path = \"psf|\[catalogue.grid)",
+            r"(?m)^((degree|[fg]_terms|fwhm|beta|oversampling|nodes|variance|rows|columns|pitch|layout"
+            r"|marks) = |path = \"psf|\[catalogue.grid)",
             "# ",
             text,
         )

@@ -39,7 +39,7 @@ def sharp_pixels(posterior: Posterior, params: Floats) -> Flags:
     expected = posterior.expected_counts(params)
     background = posterior.likelihood.background(params)
     level = params[posterior.parameter_names.index("background")]
-    variance = posterior.noise_at(params).counts_variance(expected, level)
+    variance = posterior.noise_at(params).counts_variance(np.maximum(expected, 0.0), level)
     residual = np.where(mask, posterior.counts - expected, 0.0)
     light = np.maximum(expected - background, 0.0)
     bright = mask & (light > BRIGHT * np.sqrt(variance))
