@@ -16,8 +16,13 @@ from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import reject_once
-from bayesfred.optimize.psf_equations import LARGEST_ERROR
-from bayesfred.optimize.psf_marginal import node_slopes, occam_factor, shared_information
+from bayesfred.optimize.psf_equations import LARGEST_ERROR, PsfState
+from bayesfred.optimize.psf_marginal import (
+    lit_pixels,
+    node_slopes,
+    occam_factor,
+    shared_information,
+)
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
@@ -82,7 +87,7 @@ def measure_psf(
     """
     given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
     psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes)
-    bare, top = _near(posterior, estimate, psf, model_error, given)
+    bare, top = _near(posterior, estimate, (psf, state), model_error, given)
     # single sharp pixels hide no others
     rounds = ROUNDS if bare.nuisances.model_error else 1
     for _ in range(rounds if reject_outliers else 0):
@@ -91,7 +96,7 @@ def measure_psf(
             break
         posterior = replace(posterior, mask=kept, extrapolation=None)
         psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, state)
-        bare, top = _near(posterior, estimate, psf, model_error, given)
+        bare, top = _near(posterior, estimate, (psf, state), model_error, given)
     if nodes:
         slopes = node_slopes(bare, state, top.params)
     elif bare.model.optics().translates:
@@ -122,11 +127,12 @@ def _explained(posterior: Posterior, params: Floats) -> Flags:
 def _near(
     posterior: Posterior,
     estimate: MapEstimate,
-    psf: MeasuredPSF,
+    found: tuple[MeasuredPSF, PsfState],
     model_error: bool,
     prior: Mapping[str, Any],
 ) -> tuple[Posterior, NewtonResult]:
     """The posterior with a PSF but without the PSF's errors, and its maximum."""
+    psf, state = found
     bare = posterior.with_psf(psf)
     known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
     if model_error:
@@ -135,6 +141,8 @@ def _near(
         )
     known.setdefault("model_error", min(max(psf.model_error, 1e-3), LARGEST_ERROR))
     start = np.array([known[name] for name in bare.parameter_names])
+    if not np.isfinite(bare.log_prob(start)):
+        bare = replace(bare, mask=lit_pixels(posterior, state), extrapolation=None)
     if not np.isfinite(bare.log_prob(start)):
         raise InputError(
             "psf: got one that explains some source with no flux at all, expected images that "

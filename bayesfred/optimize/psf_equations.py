@@ -362,8 +362,9 @@ def observed(
     templates = data.samples.size * np.stack([p[0], -bright * p[1], -bright * p[2]])
     light = data.image(bright * templates[0])
     residual, variance = data.residual(posterior, state.params, light)
+    known = error is not None
     error = likely_error(residual, variance, light) if error is None else error
-    variance = variance + (min(error, LARGEST_ERROR) * light) ** 2
+    variance = variance + ((error if known else min(error, LARGEST_ERROR)) * light) ** 2
     weight = 1.0 / (variance * np.maximum(1.0, residual**2 / (variance * outlying**2)))
     return Pixels(data, terms, templates, weight, weight * residual, error)
 

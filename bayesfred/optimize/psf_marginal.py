@@ -9,13 +9,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy import spatial
 from scipy.optimize import nnls
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import OccamFactor
 from bayesfred.model.threads import one_blas_thread
-from bayesfred.optimize.psf_equations import PsfEquations, PsfInformation, PsfState, observed
+from bayesfred.optimize.psf_equations import SEEN, PsfEquations, PsfInformation, PsfState, observed
 from bayesfred.optimize.psf_nodes import NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
 
@@ -102,6 +103,34 @@ def occam_factor(posterior: Posterior, state: PsfState, params: Floats) -> Occam
     scales = error * SCALES
     terms = 0.5 * np.log1p((errors[1:, None] / scales) ** 2)
     return OccamFactor(nnls(terms, volumes[1:] - volumes[0])[0], scales)
+
+
+def lit_pixels(posterior: Posterior, state: PsfState) -> Flags:
+    """The pixels without those nearest to sources that show hardly any of their light.
+
+    Where all but the wings of a source is masked, the noise would make any flux of them.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    state : PsfState
+        Where the PSF was found.
+
+    Returns
+    -------
+    ndarray of bool, shape (ny, nx)
+    """
+    data = PsfSamples.at(posterior, state.params, state.shifts, state.grid.radius)
+    light = observed(posterior, state, data, None).templates[0]
+    seen = np.bincount(data.samples.source, light, len(state.fluxes)) >= SEEN
+    at, out = posterior.likelihood.image_positions(state.params), posterior.mask.copy()
+    inside = np.flatnonzero(np.isfinite(at).all(axis=1))
+    rows, columns = np.nonzero(out)
+    middle = 0.5 * (np.array(out.shape) - 1)
+    places = np.stack([columns - middle[1], rows - middle[0]], axis=1)
+    _, nearest = spatial.cKDTree(at[inside]).query(places)
+    out[rows, columns] = seen[inside[nearest]]
+    return out
 
 
 def _at(posterior: Posterior, state: PsfState, params: Floats) -> PsfState:
