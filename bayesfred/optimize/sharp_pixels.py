@@ -52,6 +52,6 @@ def sharp_pixels(posterior: Posterior, params: Floats) -> Flags:
     own = np.abs(residual)
     least = SIGNIFICANCE * np.maximum(np.sqrt(variance), common * light)
     missing = share * own - np.maximum(np.sign(residual) * beside(residual), 0.0)
-    sd = np.sqrt(beside(variance) + share**2 * variance)
+    sd = np.sqrt(np.maximum(beside(variance) + share**2 * variance, 0.0))
     exceeds = own > np.maximum(least, SIGNIFICANCE**2)
     return np.asarray(mask & exceeds & (missing > SIGNIFICANCE * sd))
