@@ -109,6 +109,10 @@ def test_remedies_are_those_that_a_run_can_take() -> None:
     coefficients[0, 3:6, 3:6] = 4.0 / 9.0
     measured = posterior.with_psf(MeasuredPSF(coefficients, 2.0, 80.0))
     assert "psf.degree = 4" in psf_remedy(measured, "another")
+    most = measured.with_psf(MeasuredPSF(np.pad(coefficients, [(0, 9), (0, 0), (0, 0)]), 2.0, 80.0))
+    assert "psf.nodes = 7 in place of psf.degree" in psf_remedy(most, "another")
+    between = MeasuredPSF(coefficients[:5], 2.0, 80.0, nodes=2)
+    assert "psf.nodes = 6" in psf_remedy(measured.with_psf(between), "another")
 
 
 def test_a_true_model_has_no_cause() -> None:

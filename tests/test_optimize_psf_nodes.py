@@ -10,6 +10,7 @@ import bayesfred as bf
 from bayesfred.imaging.psf.spline_values import spline_coefficients
 from bayesfred.optimize import measure_psf as measuring
 from bayesfred.optimize.psf_equations import observed
+from bayesfred.optimize.psf_marginal import lit_pixels
 from bayesfred.optimize.psf_nodes import NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
 from bayesfred.optimize.psf_start import starting_grid, starting_state
@@ -81,6 +82,42 @@ def test_equations_agree_with_dense_ones():
     found = equations.solution(strength, pull, np.zeros_like(pull), 1e-9)
     np.testing.assert_allclose(found.ravel(), expected, atol=1e-4 * np.abs(expected).max())
     assert np.abs(equations.conventions @ found.T).max() < 1e-12 * np.abs(found).max()
+
+
+def test_shifts_of_single_sources_are_pulled_to_their_prior():
+    """Against the joint solution of nodes, parameters, fluxes and shifts."""
+    posterior, _ = frame_of(5, side=61, grid=4)
+    nuisances = replace(posterior.nuisances, position_scatter=True)
+    posterior = replace(posterior, nuisances=nuisances)
+    state = began(posterior, bf.find_map(posterior))
+    params, sd = state.params.copy(), 0.005  # as much as the counts tell
+    params[posterior.parameter_names.index("position_scatter")] = sd
+    shifts = np.random.default_rng(2).normal(size=state.shifts.shape) * 3.0 * sd
+    state = replace(state, params=params, shifts=shifts)
+    equations = NodeEquations.of(posterior, state, 0.02)
+    strength, start = 7.0, np.zeros((4, equations.knots))
+    found = equations.solution(strength, equations.pull, start, 1e-9).ravel()
+    own = equations.eliminated.toarray() * np.where(
+        np.isfinite(equations.lengths), equations.lengths, 0.0
+    )
+    design = np.column_stack([dense(equations), own])
+    size, width = found.size, len(design.T)
+    prior = np.zeros((16, 3))
+    prior[:, 1:] = sd**-2.0
+    precision, pulled = np.zeros((width, width)), np.zeros(width)
+    precision[:size, :size] = np.kron(np.eye(4), strength * equations.precision)
+    precision[size : size + 48, size : size + 48] = np.diag(prior.ravel())
+    pulled[size : size + 48] = -(prior * np.pad(shifts, [(0, 0), (1, 0)])).ravel()
+    rows = np.pad(np.kron(np.eye(4), equations.conventions), [(0, 0), (0, width - size)])
+    system = np.block([[design.T @ design + precision, rows.T], [rows, np.zeros((12, 12))]])
+    right = np.append(design.T @ equations.residual + pulled, np.zeros(12))
+    scale = np.sqrt(np.maximum(np.diag(system), 1.0))
+    expected = linalg.lstsq(system / np.outer(scale, scale), right / scale)[0] / scale
+    np.testing.assert_allclose(found, expected[:size], atol=1e-3 * np.abs(found).max())
+    _, change, _ = equations.solved(state.nodes)  # whose strength is of a little influence
+    moved = change[posterior.n_parameters :].reshape(16, 3)
+    joint = expected[size : size + 48].reshape(16, 3)
+    np.testing.assert_allclose(moved[:, 1:], joint[:, 1:], atol=0.05 * sd)
 
 
 def test_splines_are_the_derivatives_of_the_light():
@@ -171,6 +208,18 @@ def test_files_and_choices():
         measuring.find_psf(None, None, 4, 2, NODES)
     with pytest.raises(bf.InputError, match="nodes: got 1"):
         measuring.find_psf(None, None, 4, 0, 1)
+
+
+def test_sources_that_show_only_their_wings_are_masked():
+    posterior, _ = frame_of(1, side=61, grid=4)
+    state = began(posterior, bf.find_map(posterior))
+    x, y = posterior.likelihood.image_positions(state.params)[5]
+    u, v = posterior.model.detector.pixel_centres()
+    distance = np.hypot(u - x, v[:, None] - y)
+    hidden = replace(posterior, mask=posterior.mask & (distance > 3.0 * SIGMA))
+    lit = lit_pixels(hidden, state)
+    assert not lit[distance < 5.0].any() and lit[distance > 12.0].all()
+    assert np.array_equal(lit_pixels(posterior, state), posterior.mask)
 
 
 def test_errors_on_another_frame_are_refused():

@@ -36,6 +36,7 @@ from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.drift import Drift
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.psf_errors import refuse_nodes
 from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.fit_statistics import misfit
@@ -103,9 +104,13 @@ def read_frames(
     alone: list[MapEstimate | None] = []
     psfs: dict[str, PSF] = {}  # frames with the PSF of one file have its errors in common
     notes: list[str] = []
+    for own in run.frames.values():
+        if repr(own.psf) not in psfs:
+            psfs[repr(own.psf)] = build.reference_psf(own, run_file)
+        with naming(run_file):  # before minutes have gone by
+            refuse_nodes(psfs[repr(own.psf)])
     for name, own in run.frames.items():
-        psf = psfs.get(repr(own.psf)) or build.reference_psf(own, run_file)
-        psfs[repr(own.psf)] = psf
+        psf = psfs[repr(own.psf)]
         told = say and partial(_prefixed, say, name)
         try:
             frames[name], estimate, lines = pipeline.read_frame(own, run_file, told, psf=psf)

@@ -20,6 +20,7 @@ from bayesfred.io.frames import FrameRecord
 from bayesfred.io.pixel_maps import read_mapped_frame
 from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.psf_errors import refuse_nodes
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, reject_outliers
 from bayesfred.optimize.follow import follow_images
@@ -80,7 +81,7 @@ def read_frame(
     noise, line = build.noise_given(run, run_file, maps, frame.read_noise)
     note(frame.description, line)
     shape = (frame.counts.shape[0], frame.counts.shape[1])
-    psf = psf or build.reference_psf(run, run_file)
+    psf = psf or _reference_psf(run, run_file)
     psf, frame, lines = _by_its_peaks(run, psf, frame, noise)
     note(*lines)
     with working("finding the sources", show=say is not None):
@@ -117,6 +118,15 @@ def read_frame(
             posterior = measured
             note(psf_message(posterior, estimate))
     return posterior, _judged(given, posterior, estimate), notes
+
+
+def _reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
+    """The PSF of [psf], unless it lacks errors that a fit has to know."""
+    psf = build.reference_psf(run, run_file)
+    if isinstance(psf, MeasuredPSF):
+        with naming(run_file):
+            refuse_nodes(psf)
+    return psf
 
 
 def _by_its_peaks(

@@ -31,7 +31,7 @@ from scipy import linalg
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.imaging.psf import MeasuredPSF
+from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure
 from bayesfred.io.serialize import serializable
 from bayesfred.model.parameters import SCALES
 
@@ -52,19 +52,19 @@ def covariance_of(slopes: Floats) -> Floats:
     return np.atleast_2d(np.cov(slopes[np.isfinite(slopes).all(axis=1)].T))
 
 
-def refuse_nodes(psf: MeasuredPSF) -> None:
-    """Refuse a PSF whose draws do not hold all of its errors.
+def refuse_nodes(psf: PSF) -> None:
+    """Refuse a PSF, also one to be measured, whose draws will not hold all of its errors.
 
     Parameters
     ----------
-    psf : MeasuredPSF
+    psf : PSF
 
     Raises
     ------
     InputError
         If it varies between nodes.
     """
-    if psf.nodes:
+    if isinstance(psf, MeasuredPSF | PSFToMeasure) and psf.nodes:
         raise InputError(
             f"psf: got one that varies between {psf.nodes} x {psf.nodes} nodes, expected one with "
             "a degree for several frames: with nodes only the errors of what all sources have in "

@@ -145,12 +145,12 @@ class PsfInformation:
         np.add(half, half.T, out=joint[:size, :size])
         joint[size:, :size] = (coupling.T @ columns + offset @ select).T
         joint[size:, size:] = inner
-        free, precisions = free_templates(posterior, state, pixels)
+        free = free_templates(posterior, state, pixels)
         which = np.flatnonzero(free.ravel() & (own.diagonal() > 0.0))
         if not which.size:
             none = np.zeros((0, len(joint)))
             return cls(joint, which, none, none, np.copy)
-        precision = precisions.ravel()[which]
+        precision = shift_precision(posterior, state)[which]
         solve = splu((own[which][:, which] + sparse.diags_array(precision)).tocsc()).solve
         shared = own[which] @ columns + with_background[which] @ select
         outer = np.concatenate([coupling[which], shared], axis=1)
@@ -208,7 +208,7 @@ class PsfEquations:
         inner += [priors.slope(prior, x)[0] for prior, x in given]
         inner[[name in HELD for name in posterior.parameter_names]] = 0.0
         shifts = np.column_stack([state.fluxes, state.shifts]).ravel()
-        own -= free_templates(posterior, state, pixels)[1].ravel() * shifts
+        own -= shift_precision(posterior, state) * shifts
         step = information.solve(own[information.which])
         pull = np.concatenate([psf, inner]) - step @ information.outer
         out = cls(state, information, pull, step, pixels.model_error)
@@ -376,17 +376,19 @@ def _acting(posterior: Posterior, state: PsfState) -> tuple[Floats, Floats]:
     return columns, np.eye(posterior.n_parameters)[levels]
 
 
-def free_templates(posterior: Posterior, state: PsfState, pixels: Pixels) -> tuple[Flags, Floats]:
-    """Of every source's flux and shifts, shape (s, 3): whether they are free, and their precision.
-
-    The precision is the prior's: 0 of fluxes.
-    """
+def free_templates(posterior: Posterior, state: PsfState, pixels: Pixels) -> Flags:
+    """Which of every source's flux and shifts are free, shape (s, 3)."""
     free = np.zeros((len(state.fluxes), 3), bool)
     free[:, 0] = posterior.nuisances.flux == "free"
     free[:, 1:] = posterior.nuisances.position_scatter
     light = np.bincount(pixels.data.samples.source, pixels.templates[0], len(free))
     free[light < SEEN] = False  # wings alone would make of noise any flux
-    precision = np.zeros(free.shape)
+    return free
+
+
+def shift_precision(posterior: Posterior, state: PsfState) -> Floats:
+    """The prior's, of every source's flux and shifts, shape (3 s,): 0 of fluxes."""
+    out = np.zeros((len(state.fluxes), 3))
     if posterior.nuisances.position_scatter:
-        precision[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
-    return free, precision
+        out[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
+    return out.ravel()

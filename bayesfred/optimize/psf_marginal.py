@@ -125,10 +125,8 @@ def lit_pixels(posterior: Posterior, state: PsfState) -> Flags:
     seen = np.bincount(data.samples.source, light, len(state.fluxes)) >= SEEN
     at, out = posterior.likelihood.image_positions(state.params), posterior.mask.copy()
     inside = np.flatnonzero(np.isfinite(at).all(axis=1))
-    rows, columns = np.nonzero(out)
-    middle = 0.5 * (np.array(out.shape) - 1)
-    places = np.stack([columns - middle[1], rows - middle[0]], axis=1)
-    _, nearest = spatial.cKDTree(at[inside]).query(places)
+    (u, v), (rows, columns) = posterior.model.detector.pixel_centres(), np.nonzero(out)
+    _, nearest = spatial.cKDTree(at[inside]).query(np.stack([u[columns], v[rows]], axis=1))
     out[rows, columns] = seen[inside[nearest]]
     return out
 

@@ -30,7 +30,13 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.psf_equations import PsfState, free_templates, node_weights, observed
+from bayesfred.optimize.psf_equations import (
+    PsfState,
+    free_templates,
+    node_weights,
+    observed,
+    shift_precision,
+)
 from bayesfred.optimize.psf_levels import LIMITS, PsfNodes
 from bayesfred.optimize.psf_samples import OUTLYING, PsfSamples, source_columns
 
@@ -109,14 +115,14 @@ class NodeEquations:
             (own.ravel(), (np.tile(data.owner[inside], 3), columns)), (root.size, 3 * sources)
         )[rows]
         parameters = templates @ source_columns(posterior, state.params, state.fluxes)
-        free, precision = (each.ravel() for each in free_templates(posterior, state, pixels))
+        free = free_templates(posterior, state, pixels).ravel()
         eliminated = sparse.hstack([templates * free, parameters]).tocsc()
         squares = eliminated.multiply(eliminated).sum(axis=0)
         lengths = np.sqrt(np.asarray(squares, dtype=np.float64).ravel())
         lengths[lengths == 0.0] = np.inf  # what is known changes by 0
         eliminated = (eliminated @ sparse.diags_array(1.0 / lengths)).tocsc()
         values = np.column_stack([state.fluxes, state.shifts]).ravel()
-        known = np.zeros((2, lengths.size))
+        precision, known = shift_precision(posterior, state), np.zeros((2, lengths.size))
         known[:, : precision.size] = precision, precision * values
         weights = node_weights(posterior, state.nodes.number)
         residual = (pixels.score / root)[rows] + splines @ state.nodes.splines(weights).ravel()
@@ -136,18 +142,31 @@ class NodeEquations:
         known = self.known[0] / self.lengths**2 + TINY
         return splu((own + sparse.diags_array(known)).tocsc())
 
-    def _explained(self, values: Floats) -> Floats:
-        """The change of what is eliminated, in columns of unit length, that explains values."""
-        return np.asarray(self._own.solve(self.eliminated.T @ values))
+    def _explained(self, values: Floats, tied: Floats | float = 0.0) -> Floats:
+        """The change of what is eliminated that explains values, in columns of unit length.
 
-    def _remaining(self, values: Floats) -> Floats:
+        `tied` is the pull of what is known of them beside the counts.
+        """
+        return np.asarray(self._own.solve(self.eliminated.T @ values + tied))
+
+    def _remaining(self, values: Floats, tied: Floats | float = 0.0) -> Floats:
         """Without what is eliminated explains."""
-        return np.asarray(values - self.eliminated @ self._explained(values))
+        return np.asarray(values - self.eliminated @ self._explained(values, tied))
 
     def _pull(self, values: Floats) -> Floats:
         """The slope by the nodes' coefficients, given that by the pixels."""
         each = (self.splines.T @ values).reshape(-1, self.knots)
         return np.asarray(self.weights.T @ each)
+
+    @property
+    def _tied(self) -> Floats:
+        """The pull of what is known of the eliminated beside the counts."""
+        return np.asarray(-self.known[1] / self.lengths)
+
+    @property
+    def pull(self) -> Floats:
+        """The slope by the nodes' coefficients where they are 0, shape (nodes, knots)."""
+        return self._pull(self._remaining(self.residual, self._tied))
 
     @cached_property
     def _bright(self) -> Floats:
@@ -229,9 +248,7 @@ class NodeEquations:
         far : float
             Largest change of a parameter, in its standard deviations with a known PSF.
         """
-        tied = -self.known[1] / self.lengths  # the pull of what is known beside the counts
-        residual = self.residual - self.eliminated @ self._own.solve(tied)
-        pull, strength = self._pull(self._remaining(residual)), before.strength
+        pull, strength = self.pull, before.strength
         found = before.coefficients.reshape(-1, self.knots)
         for _ in range(CHOICES):
             found = self.solution(strength, pull, found)
@@ -245,7 +262,7 @@ class NodeEquations:
                 break
         side, d = math.isqrt(self.knots), self.parameters.shape[1]
         light = self.splines @ (self.weights @ found).ravel()
-        own = self._own.solve(self.eliminated.T @ (self.residual - light) + tied)
+        own = self._explained(self.residual - light, self._tied)
         each = self._own.solve(np.eye(own.size, d, d - own.size))[-d:]
         far = float(np.max(np.abs(own[-d:]) / np.sqrt(np.diag(each))))
         own /= self.lengths
