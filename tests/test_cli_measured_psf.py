@@ -157,6 +157,22 @@ def test_bad_choices_are_refused(frames: Path, tmp_path: Path, psf: str, said: s
     assert_refused(invoke(tmp_path, "fit", "bad.toml"), "bad.toml", said)
 
 
+def test_a_file_of_a_psf_between_nodes_is_refused(frames: Path, tmp_path: Path) -> None:
+    """Its draws do not hold the errors of the nodes."""
+    x = np.arange(-12, 13) / 4.0
+    round_one = np.exp(-0.5 * (x**2 + x[:, None] ** 2))
+    c = np.concatenate([round_one[None], np.zeros((4, 25, 25))])
+    bf.MeasuredPSF(c, 4.0, 64.0, nodes=2, draws=c[None, :1]).write(tmp_path / "nodes.fits")
+    for name in ("one.npy", "stars.csv"):
+        (tmp_path / name).write_bytes((frames / name).read_bytes())
+    (tmp_path / "run.toml").write_text(
+        RUN.format(frame="one.npy", psf='kind = "file"\npath = "nodes.fits"', output="run.h5"),
+        encoding="utf-8",
+    )
+    said = "run.toml: psf: got one that varies between 2 x 2 nodes"
+    assert_refused(invoke(tmp_path, "fit", "run.toml"), said)
+
+
 def test_photutils_renders_the_same_psf() -> None:
     photutils = pytest.importorskip("photutils.psf")
     x = np.arange(-20, 21) / 4.0

@@ -591,6 +591,16 @@ def test_frames_maxima_are_where_the_search_begins(folder: Path) -> None:
 
 
 @pytest.mark.long
+def test_a_psf_between_nodes_is_refused_before_any_is_measured(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "read_frame", lambda *_, **__: pytest.fail("a frame was read"))
+    psf = 'kind = "measured"\nsigma = 2.0\nnodes = 3'
+    (folder / "nodes.toml").write_text(RUN.replace("sigma = 2.0", psf))
+    found = invoke(folder, "fit", "nodes.toml", "--map-only")
+    assert_refused(found, "nodes.toml: psf: got one that varies between 3 x 3 nodes", "a degree")
+
+
 def test_psfs_are_measured_on_each_frame_or_shared_from_a_file(folder: Path) -> None:
     def read(psf: str) -> bf.JointPosterior:
         text = RUN.replace("sigma = 2.0", psf)
