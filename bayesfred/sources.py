@@ -7,7 +7,9 @@ stars of the frame. A frame that is still to be simulated has none: there the gu
 """
 
 import math
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +44,7 @@ def find_sources(
     shape: tuple[int, int],
     psf: PSF,
     frame: FrameRecord | None = None,
-) -> tuple[SourceCatalog, list[str]]:
+) -> tuple[SourceCatalog, list[str], str]:
     """The catalogue's sources whose light can reach the frame.
 
     A source is at the edge if the frame's border is within three widths of the PSF, or between it
@@ -65,6 +67,8 @@ def find_sources(
     sources : SourceCatalog
     notes : list of str
         Where the frame points, if that was searched for, and how many sources there are.
+    ambiguous : str
+        Which other poses of the frame fit alike; empty where there is none.
 
     Raises
     ------
@@ -80,7 +84,7 @@ def find_sources(
     column = None if free and "flux" not in c.model_fields_set else c.flux
     binning = run.detector.binning
     width = math.hypot(psf.sigma / binning, 12.0**-0.5)
-    sky, notes = None, []
+    sky, notes, ambiguous = None, [], ""
     if c.ra is None or c.dec is None:
         record = read_catalogue(
             path, x=c.x, y=c.y, flux=column, magnitude=c.magnitude, zero_point=c.zero_point
@@ -93,7 +97,7 @@ def find_sources(
             path, ra=c.ra, dec=c.dec, flux=column, magnitude=c.magnitude,
             zero_point=c.zero_point, motion=motion, epoch=c.epoch or 2000.0, date=date,
         )  # fmt: skip
-        sky, line = _plane(run, run_file, shape, width, (stars, frame))
+        sky, line, ambiguous = _plane(run, run_file, shape, width, (stars, frame))
         notes += [line] if line else []
         x, y = sky.to_plane(stars.ra, stars.dec)
         seen = np.isfinite(x)
@@ -111,12 +115,12 @@ def find_sources(
         flux = np.full_like(flux, typical_flux(frame.counts, frame.valid, width, max(inside, 1)))
         numbers += f"; without fluxes, which are free and begin at {flux[0]:.3g} counts"
     sources = SourceCatalog(x[kept], y[kept], flux[kept], sky)
-    return sources, [*notes, f"{printable(path.name)}: {numbers}"]
+    return sources, [*notes, f"{printable(path.name)}: {numbers}"], ambiguous
 
 
 def _target(
     run: settings.RunSettings, run_file: Path, psf: PSF, frame: FrameRecord | None
-) -> tuple[SourceCatalog, list[str]]:
+) -> tuple[SourceCatalog, list[str], str]:
     """The marks of a target that the frame shows."""
     grid, binning = run.catalogue.grid, run.detector.binning
     if frame is None or grid is None:
@@ -140,7 +144,8 @@ def _target(
     notes = [f"grid: {found.message}"]
     if grid.marks == "dots":
         notes.append("dots: counts inverted, twice the white level less the counts")
-    return sources, notes
+    # positions are in the frame's own axes, whichever row of the target is called the first
+    return sources, notes, ""
 
 
 def bright(
@@ -183,8 +188,8 @@ def _plane(
     shape: tuple[int, int],
     width: float,
     seen: tuple[SkyRecord, FrameRecord | None],
-) -> tuple[TangentPlane, str]:
-    """The object plane of a frame on the sky, in fine pixels, and a line that says how it lies."""
+) -> tuple[TangentPlane, str, str]:
+    """The object plane of a frame on the sky, in fine pixels, in words, and others that fit."""
     s, (stars, frame), binning = run.sky, seen, run.detector.binning
     angle, parity = s.position_angle, s.parity
     if s.pointing is not None and s.pixel_scale is not None:
@@ -199,17 +204,23 @@ def _plane(
             "sky.pixel_scale"
         )
     if frame is None:
-        return guess, ""
-    peaks = binning * bright_peaks(frame.counts, frame.valid, width)[0]
+        return guess, "", ""
+    peaks, heights = bright_peaks(frame.counts, frame.valid, width)
     flux = np.where(np.isfinite(stars.flux), stars.flux, 1.0)
     fine: tuple[int, int] = (shape[0] * binning, shape[1] * binning)
+    find = partial(
+        find_pose, binning * peaks, (stars.ra, stars.dec, flux), guess, fine, heights=heights
+    )
     try:
-        pose = find_pose(
-            peaks, (stars.ra, stars.dec, flux), guess, fine, angle=angle, parity=parity
-        )
+        pose = find(angle=angle, parity=parity)
     except InputError as error:
         raise InputError(f"{run_file}: {error}") from None
-    return pose.plane, pose.message
+    if pose.ambiguous and s.pointing is None:  # a header that is right knows the angle, too
+        with suppress(InputError):
+            angle = guess.position_angle if angle is None else angle
+            pose = find(angle=angle, parity=parity or guess.parity)
+    lines = (pose.message, pose.ambiguous)
+    return pose.plane, "; ".join(filter(None, lines)), pose.ambiguous
 
 
 def _pointing(

@@ -590,11 +590,32 @@ def test_frames_maxima_are_where_the_search_begins(folder: Path) -> None:
     assert np.abs((again.params - estimate.params) / sd).max() < 2e-3
 
 
+@pytest.mark.parametrize("share", [0.5, 0.3])
+def test_a_frame_most_of_whose_sources_were_rejected_does_not_fit(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, share: float
+) -> None:
+    """The search for the maximum of all frames rejects nothing itself."""
+    text = RUN.replace("[catalogue]", "[frame]\nreject_outliers = true\n[catalogue]", 1)
+    (folder / "run.toml").write_text(text)
+    shares = iter([0.0, share, 0.1])
+    monkeypatch.setattr(pipeline, "share_lost", lambda *_: next(shares))
+    run = read_run(folder / "run.toml")
+    assert isinstance(run, JointRun)
+    joint, estimate, _ = joint_pipeline.read_frames(run, folder / "run.toml", None)
+    assert estimate is not None and estimate.at_maximum
+    assert estimate.fits_data == (share < 0.4)
+    assert ("; b: but over 40 % of the sources" in estimate.message) == (share > 0.4)
+    assert estimate.message.count("over 40 %") == (share > 0.4)
+    diagnostics = bf.diagnose(bf.laplace(joint, estimate, seed=1))
+    assert diagnostics.trustworthy == (share < 0.4)
+    assert ("b: but over 40 %" in diagnostics.message) == (share > 0.4)
+
+
 @pytest.mark.long
 def test_a_psf_between_nodes_is_refused_before_any_is_measured(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "read_frame", lambda *_, **__: pytest.fail("a frame was read"))
+    monkeypatch.setattr(pipeline, "read_doubted", lambda *_, **__: pytest.fail("a frame was read"))
     psf = 'kind = "measured"\nsigma = 2.0\nnodes = 3'
     (folder / "nodes.toml").write_text(RUN.replace("sigma = 2.0", psf))
     found = invoke(folder, "fit", "nodes.toml", "--map-only")

@@ -110,7 +110,7 @@ def judge_frames(
             f"deviations {side} expectation, {sizes[worst]:.1f} in the worst ({worst})."
         )
     if not estimate.fits_data and not wrong:
-        fits, sentence = False, f"The model does not fit all counts: {estimate.message}."
+        fits, sentence = False, f"The parameters may be wrong: {estimate.message}."
     sentence = f"{sentence} {agreement.message}" if agreement.agree else (
         f"{agreement.message} {sentence}"
     )  # fmt: skip

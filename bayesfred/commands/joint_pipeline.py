@@ -38,7 +38,7 @@ from bayesfred.model.joint import JointPosterior
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import refuse_nodes
 from bayesfred.optimize.estimate import MapEstimate, inverse
-from bayesfred.optimize.find_map import find_map
+from bayesfred.optimize.find_map import MOST_NAMED, find_map
 from bayesfred.optimize.fit_statistics import misfit
 from bayesfred.optimize.joint_map import marginalize_joint_psf
 from bayesfred.reporting.joint import agreement_plot, joint_figures, write_joint_report
@@ -91,7 +91,8 @@ def read_frames(
     posterior : JointPosterior
         With the errors of PSFs that were measured.
     estimate : MapEstimate or None
-        Its maximum, if frames' own maxima were needed to read them.
+        Its maximum, if frames' own maxima were needed to read them, or where there are doubts of a
+        frame: then the model does not fit, and the message names the frame.
     notes : list of str
         Those of every frame, after its name.
 
@@ -102,6 +103,7 @@ def read_frames(
     """
     frames: dict[str, Posterior] = {}
     alone: list[MapEstimate | None] = []
+    doubts: list[str] = []
     psfs: dict[str, PSF] = {}  # frames with the PSF of one file have its errors in common
     notes: list[str] = []
     for own in run.frames.values():
@@ -113,20 +115,28 @@ def read_frames(
         psf = psfs[repr(own.psf)]
         told = say and partial(_prefixed, say, name)
         try:
-            frames[name], estimate, lines = pipeline.read_frame(own, run_file, told, psf=psf)
+            read = pipeline.read_doubted(own, run_file, told, psf=psf)
         except InputError as error:
             raise InputError(f"{error} (frame {name})") from None
+        frames[name], estimate, lines, why = read
         alone.append(estimate)
         notes += [f"{name}: {line}" for line in lines]
+        doubts += [f"{name}: {'; '.join(why)}"] if why else []
     with naming(run_file), working(show=say is not None):
         joint = _joint(run, frames)
         start, found = _start(joint, alone), None
         if any(isinstance(frame.model.psf, MeasuredPSF) for frame in frames.values()):
             start = find_map(joint, start).params
             joint = marginalize_joint_psf(joint, start)
-        if start is not None:
+        if start is not None or doubts:
             found = find_map(joint, start)
-    return joint, found, _kept(notes)
+    return joint, found and pipeline.doubted(found, _named(doubts)), _kept(notes)
+
+
+def _named(doubts: Sequence[str]) -> list[str]:
+    """Those of the first frames, and how many more there are."""
+    more = len(doubts) - MOST_NAMED
+    return [*doubts[:MOST_NAMED], *([f"and {more} more frames"] if more > 0 else [])]
 
 
 def _prefixed(say: Say, name: str, line: str) -> None:

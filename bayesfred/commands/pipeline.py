@@ -3,6 +3,7 @@
 Nothing is printed. What should be known while a step works goes to `say`, one line at a time.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
 
-__all__ = ["fit_frame", "read_frame"]
+__all__ = ["doubted", "fit_frame", "read_doubted", "read_frame"]
 
 ANOTHER = 2.0  # times the frame's own width: a start that is farther off is not used
 
@@ -55,9 +56,61 @@ def read_frame(
     -------
     posterior : Posterior
     estimate : MapEstimate or None
-        Its maximum, if outliers were rejected or terms chosen.
+        Its maximum, if outliers were rejected or terms chosen, or where there are doubts: then the
+        model does not fit, and the message says why.
     notes : list of str
         What was read, what was removed, and what was chosen.
+
+    Raises
+    ------
+    InputError
+        If frame, catalogue or settings are unusable.
+    """
+    posterior, estimate, notes, doubts = read_doubted(run, run_file, say, psf=psf)
+    if doubts and estimate is None:
+        with naming(run_file), working(show=say is not None):
+            estimate = find_map(posterior)
+    return posterior, estimate and doubted(estimate, doubts), notes
+
+
+def doubted(estimate: MapEstimate, doubts: Sequence[str]) -> MapEstimate:
+    """A maximum that does not fit if there are doubts, which its message says.
+
+    Parameters
+    ----------
+    estimate : MapEstimate
+    doubts : sequence of str
+
+    Returns
+    -------
+    MapEstimate
+    """
+    new = [doubt for doubt in doubts if doubt not in estimate.message]
+    message = "; ".join([estimate.message, *new])
+    return replace(estimate, message=message, fits_data=estimate.fits_data and not doubts)
+
+
+def read_doubted(
+    run: settings.RunSettings, run_file: Path, say: Say | None, *, psf: PSF | None = None
+) -> tuple[Posterior, MapEstimate | None, list[str], list[str]]:
+    """Read the frame of a run file as `read_frame` does, and say apart what no residuals show.
+
+    Parameters
+    ----------
+    run : RunSettings
+    run_file : Path
+    say : callable, optional
+    psf : PSF, optional
+
+    Returns
+    -------
+    posterior : Posterior
+    estimate : MapEstimate or None
+        Its maximum, if outliers were rejected or terms chosen.
+    notes : list of str
+    doubts : list of str
+        Why parameters may be wrong although the model fits: another pose fits as well, or most of
+        the sources were rejected.
 
     Raises
     ------
@@ -85,7 +138,7 @@ def read_frame(
     psf, frame, lines = _by_its_peaks(run, psf, frame, noise)
     note(*lines)
     with working("finding the sources", show=say is not None):
-        sources, lines = find_sources(run, run_file, shape, psf, frame)
+        sources, lines, ambiguous = find_sources(run, run_file, shape, psf, frame)
     note(*lines)
     counts, noise = bright(run, run_file, frame, noise)
     with naming(run_file):
@@ -117,7 +170,8 @@ def read_frame(
             note(line if lost.any() else "")
             posterior = measured
             note(psf_message(posterior, estimate))
-    return posterior, _judged(given, posterior, estimate), notes
+    doubts = [_rejected(given, posterior, estimate), ambiguous]
+    return posterior, estimate, notes, list(filter(None, doubts))
 
 
 def _reference_psf(run: settings.RunSettings, run_file: Path) -> PSF:
@@ -187,14 +241,11 @@ def _with_measured_psf(
     return posterior, find_map(posterior, estimate.params)
 
 
-def _judged(given: Posterior, kept: Posterior, estimate: MapEstimate | None) -> MapEstimate | None:
-    """The maximum, which does not fit where most of the sources were rejected on the way."""
-    if estimate is None or not estimate.fits_data:
-        return estimate
-    if share_lost(given, kept, estimate.params) <= BREAKDOWN:
-        return estimate
-    message = f"{estimate.message}; {MOSTLY_REJECTED}"
-    return replace(estimate, message=message, fits_data=False)
+def _rejected(given: Posterior, kept: Posterior, estimate: MapEstimate | None) -> str:
+    """What is said where most of the sources were rejected on the way to a maximum."""
+    if estimate is None or share_lost(given, kept, estimate.params) <= BREAKDOWN:
+        return ""
+    return MOSTLY_REJECTED
 
 
 def _census(posterior: Posterior, kept: Posterior) -> str:

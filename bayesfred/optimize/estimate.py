@@ -80,7 +80,9 @@ class MapEstimate:
         of parameters at a bound of their prior it may point out of the support.
     fits_data : bool
         Whether deviance and Pearson's statistic there are what the noise makes them, within 5
-        standard deviations, and enough sources are matched. `diagnose` tests more.
+        standard deviations, and enough sources are matched. It is False where the parameters may
+        be wrong although they are: where most sources were rejected, or the catalogue is symmetric
+        and another pose of the frame fits as well. `diagnose` tests more.
     modes : Modes or None
         All modes, that of `params` among them, where the posterior has several or has mass
         between them; None where `params` and `covariance` describe it.

@@ -12,19 +12,25 @@ scored by the number of peaks that it brings near to a star. So the search is ex
 random numbers, and knows how many peaks would agree by chance. Similarity and tangent point are
 then fitted to all stars that agree. The terms of degree 1 and the offset of the distortion take
 over from there.
+
+Where the catalogue is symmetric, other poses bring as many peaks to stars: `pose_aliases` finds
+them. The one that explains positions and brightness best is taken. Where it does so no better than
+another, but for chance, the pose says that it is ambiguous.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage, spatial, stats
+from scipy import spatial, stats
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.io.tangent_plane import ARCSEC, Parity, TangentPlane, rows
+from bayesfred.optimize.pose_aliases import find_aliases, log_evidence
+from bayesfred.optimize.pose_refine import Complex, Raster, RefinedPose, Stars, moved, refine
 
 __all__ = ["Pose", "find_pose"]
 
@@ -37,17 +43,14 @@ MORE_STARS = 1.5  # ... and stars for the same area, as the brightest peaks may 
 SHORTEST = 0.15  # shortest distance of a pair, of the frame's diagonal
 NEAR = 0.006  # a peak is near to a star, of the frame's diagonal
 CHANCE = 1e-6  # largest probability that peaks agree by chance
-LEAST_NEAR = 1.0  # pixel: least distance within which stars and peaks are matched in the end
-ROUNDS = 10
-FINE = 3  # cells of the raster for the distance within which a peak is near to a star
-LARGEST = 8192  # cells along a side of the raster
 MOST_PEAKS = 100
 DEEPER = 4.0  # the brightest stars against which a pose is tested, for each peak of the frame
 BLOCK = 2**17  # similarities that are tested at once: what fits the memory
 LONGEST = 3e7  # similarities of one search; those of the brightest peaks come first
 MOST_TRIED = 1e10  # similarities: of so many none agrees by chance with what ends a search early
-
-Complex = NDArray[np.complex128]
+MOST_STARS = 6000  # among which aliases are looked for
+MOST_NAMED = 3  # pointings
+SEEN = {"sky": "as on the sky", "mirrored": "mirrored"}
 
 
 class Pose(NamedTuple):
@@ -63,24 +66,31 @@ class Pose(NamedTuple):
         Of their distances along one axis, by the similarity alone: distortion is left in.
     message : str
         One line.
+    ambiguous : str
+        Which other poses fit alike, and what would tell; empty where there is none.
     """
 
     plane: TangentPlane
     matched: int
     rms: float
     message: str
+    ambiguous: str
 
 
 def find_pose(
     peaks: Floats,
-    stars: tuple[Floats, Floats, Floats],
+    stars: Stars,
     guess: TangentPlane,
     shape: tuple[int, int],
     *,
+    heights: Floats | None = None,
     angle: float | None = None,
     parity: Parity | None = None,
 ) -> Pose:
     """Find the pose of a frame within 1 degree and 5 % in scale of a guess.
+
+    Of poses that a symmetric catalogue makes alike the one is taken that explains positions and
+    brightness best; of equally good ones that which points nearest to the guess.
 
     Parameters
     ----------
@@ -92,6 +102,8 @@ def find_pose(
         Its direction and pixel scale are used.
     shape : (int, int), pixel of the fine grid
         Rows and columns of the frame.
+    heights : ndarray, shape (n,), optional
+        Of the peaks, in any unit: their brightness.
     angle : float, optional, degree
         Position angle, known to 5 degrees; by default any.
     parity : {"sky", "mirrored"}, optional
@@ -141,12 +153,99 @@ def find_pose(
             f"{len(stars[0])}, more of them than by chance, expected one: check pointing, "
             "pixel_scale and the units of the catalogue"
         )
-    return _refined(on_frame, stars, found, NEAR * diagonal)
+    pose = refine(on_frame, stars, found, NEAR * diagonal)
+    some = _around(pose.plane, stars, len(peaks), shape)
+    first = refine(on_frame, some, pose.plane, pose.near)
+    possible = partial(_possible, guess=guess, angle=angle, parity=parity)
+    aliases = find_aliases(on_frame, some, first, shape, NEAR * diagonal, possible)
+    if not aliases:
+        return _described(pose, [])
+    poses = [first, *aliases]
+    number = len(first.star)
+    evidence = np.array(
+        [log_evidence(on_frame, heights, some, each, shape, number) for each in poses]
+    )
+    alike = np.flatnonzero(evidence > evidence.max() + np.log(CHANCE))
+    away = [_away(poses[k].plane, guess) for k in alike]
+    best, *others = [poses[k] for k in alike[np.argsort(away, kind="stable")]]
+    return _described(best, [other.plane for other in others])
+
+
+def _around(plane: TangentPlane, stars: Stars, peaks: int, shape: tuple[int, int]) -> Stars:
+    """Stars as bright as those of the frame, in and around it: of equal ones the nearest."""
+    x, y = plane.to_plane(*stars[:2])
+    distance = np.hypot(x, y)
+    radius = 0.5 * float(np.hypot(*shape)) + 2.0 * POINTING_ERROR * ARCSEC / plane.pixel_scale
+    share = np.pi * radius**2 / (shape[0] * shape[1])
+    order = np.lexsort((distance, -stars[2]))
+    order = order[distance[order] < radius]
+    order = order[: min(int(DEEPER * share * peaks), MOST_STARS)]
+    return stars[0][order], stars[1][order], stars[2][order]
+
+
+def _possible(
+    plane: TangentPlane, guess: TangentPlane, angle: float | None, parity: Parity | None
+) -> bool:
+    """Whether a pose is within the limits of the guess."""
+    turned = 0.0 if angle is None else _turned(plane, angle)
+    near = _away(plane, guess) < POINTING_ERROR and abs(turned) < ANGLE_ERROR
+    return near and parity in (None, plane.parity)
+
+
+def _away(plane: TangentPlane, guess: TangentPlane) -> float:
+    """How far a pose points from the guess, in degrees."""
+    offset = np.hypot(*guess.to_plane(plane.ra, plane.dec))
+    return float(offset) * guess.pixel_scale / ARCSEC
+
+
+def _turned(plane: TangentPlane, angle: float) -> float:
+    """By how much a pose is turned from a position angle, -180 to 180 degrees."""
+    return (plane.position_angle - angle + 180.0) % 360.0 - 180.0
+
+
+def _described(pose: RefinedPose, alike: Sequence[TangentPlane]) -> Pose:
+    """A pose in words, with others that fit alike."""
+    plane = pose.plane
+    message = (
+        f"pose: {len(pose.star)} stars matched to peaks within {pose.near:.2g} px (rms "
+        f"{pose.rms:.2f}); RA {plane.ra:.4f}, Dec {plane.dec:.4f} degrees, "
+        f"{plane.pixel_scale:.3f} arcsec per pixel, position angle {plane.position_angle:.2f} "
+        f"degrees, {SEEN[plane.parity]}"
+    )
+    return Pose(plane, len(pose.star), pose.rms, message, _ambiguous(plane, alike))
+
+
+def _ambiguous(plane: TangentPlane, alike: Sequence[TangentPlane]) -> str:
+    """One sentence about other poses; empty where there is none."""
+    if not alike:
+        return ""
+    tell, angles, pointings = set[str](), dict[Parity, list[str]](), []
+    for other in alike:
+        turned = _turned(other, plane.position_angle)
+        if abs(turned) < ANGLE_ERROR and other.parity == plane.parity:
+            pointings.append(f"RA {other.ra:.4f}, Dec {other.dec:.4f}")
+            continue
+        tell.add("sky.parity" if other.parity != plane.parity else "sky.position_angle")
+        angle = f"{round(other.position_angle, 1) + 0.0:.1f}"
+        if angle not in angles.setdefault(other.parity, []):
+            angles[other.parity].append(angle)
+    others = [
+        f"position angle {' or '.join(found)} degrees {SEEN[seen]}"
+        for seen, found in angles.items()
+    ]
+    if pointings:
+        others.append(" or ".join(pointings[:MOST_NAMED]) + " degrees")
+    given = "".join(f"{key}, " for key in sorted(tell, reverse=True))
+    return (
+        "but the catalogue is symmetric, and its stars fit the frame as well at "
+        f"{', or '.join(others)}, so that the pose may be wrong: give {given}a catalogue with "
+        "fluxes that differ, or sources that break the symmetry"
+    )
 
 
 def _search(
     peaks: Complex,
-    stars: tuple[Floats, Floats, Floats],
+    stars: Stars,
     bright: Ints,
     guess: TangentPlane,
     shape: tuple[int, int],
@@ -178,7 +277,7 @@ def _search(
     for mirrored in (False, True):
         if parity is not None and mirrored != (parity == "mirrored"):
             continue
-        lookup = _Raster(_flipped(field, mirrored=mirrored), NEAR * diagonal)
+        lookup = Raster(_flipped(field, mirrored=mirrored), NEAR * diagonal)
         for a, b in _similarities(peaks[:number], _flipped(some, mirrored=mirrored), diagonal):
             made += a.size
             if made > LONGEST:
@@ -197,33 +296,6 @@ def _search(
                 if chance(best, MOST_TRIED) < CHANCE:
                     return plane
     return plane if chance(best, tried) < CHANCE else None
-
-
-class _Raster:
-    """Which cells of the plane are near to a star: similarities are looked up there."""
-
-    def __init__(self, stars: Complex, near: float) -> None:
-        low, high = (f([f(stars.real), f(stars.imag)]) for f in (np.min, np.max))
-        self.low, self.cell = low, max(near / FINE, (high - low) / LARGEST)
-        side = int((high - low) / self.cell) + 3
-        empty = np.ones((side, side), dtype=bool)
-        row, column = (
-            np.rint((p - low) / self.cell).astype(int) + 1 for p in (stars.imag, stars.real)
-        )
-        empty[row, column] = False
-        self.occupied = ndimage.distance_transform_edt(empty) < near / self.cell
-        # what is beyond the catalogue ends here
-        self.occupied[[0, -1], :] = self.occupied[:, [0, -1]] = False
-
-    def agreeing(self, peaks: Complex, a: Complex, b: Complex) -> Ints:
-        """How many peaks each similarity brings near to a star."""
-        at = (peaks[None] - b[:, None]) / a[:, None]
-        row, column = (
-            np.clip(np.rint((p - self.low) / self.cell) + 1.0, 0, len(self.occupied) - 1)
-            for p in (at.imag, at.real)
-        )
-        near = self.occupied[row.astype(int), column.astype(int)]
-        return np.asarray(near.sum(axis=1, dtype=np.int64))
 
 
 def _flipped(stars: Complex, *, mirrored: bool) -> Complex:
@@ -263,53 +335,4 @@ def _plane(flat: TangentPlane, a: complex, b: complex, *, mirrored: bool) -> Tan
     matrix = np.array([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
     if not mirrored:
         matrix[0] *= -1.0
-    return _moved(TangentPlane(flat.ra, flat.dec, rows(matrix), (b.real, b.imag)))
-
-
-def _moved(plane: TangentPlane) -> TangentPlane:
-    """The plane that touches the sky where the middle of the frame points, of the same slope."""
-    ra, dec = plane.to_sky(0.0, 0.0)
-    unit = TangentPlane(float(ra), float(dec), ((1.0, 0.0), (0.0, 1.0)))
-    step = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
-    xi, eta = unit.to_plane(*plane.to_sky(*step))
-    matrix = 0.5 * np.array([[p[0] - p[1], p[2] - p[3]] for p in (xi, eta)])
-    return TangentPlane(float(ra), float(dec), rows(matrix))
-
-
-def _refined(
-    peaks: Complex, stars: tuple[Floats, Floats, Floats], plane: TangentPlane, near: float
-) -> Pose:
-    """The similarity that fits all stars with a peak, and the plane in the frame's middle."""
-    tree = spatial.cKDTree(np.stack([peaks.real, peaks.imag], axis=1))
-    mirrored = plane.parity == "mirrored"
-    matched, rms = 0, np.inf
-    for _ in range(ROUNDS):
-        x, y = plane.to_plane(*stars[:2])
-        known = np.flatnonzero(np.isfinite(x))
-        distance, peak = tree.query(
-            np.stack([x[known], y[known]], axis=1), distance_upper_bound=near
-        )
-        some = np.flatnonzero(np.isfinite(distance))
-        some = some[np.argsort(distance[some], kind="stable")]
-        some = some[np.unique(peak[some], return_index=True)[1]]  # the nearest star of each peak
-        if len(some) < 3:
-            break
-        star, d = known[some], peaks[peak[some]]
-        s = x[star] + 1j * y[star]
-        centre, middle = s.mean(), d.mean()
-        a = np.vdot(s - centre, d - middle) / np.vdot(s - centre, s - centre)
-        b = middle - a * centre
-        left = np.abs(d - a * s - b)
-        matched, rms = len(some), float(np.sqrt(0.5 * np.mean(left**2)))
-        turn = np.array([[a.real, -a.imag], [a.imag, a.real]])
-        matrix = np.array(plane.matrix) @ np.linalg.inv(turn)
-        # a shift by b of the frame's coordinates
-        plane = _moved(TangentPlane(plane.ra, plane.dec, rows(matrix), (b.real, b.imag)))
-        near = max(LEAST_NEAR, min(near, 3.0 * float(np.sqrt(2.0) * rms)))
-    seen = "mirrored" if mirrored else "as on the sky"
-    message = (
-        f"pose: {matched} stars matched to peaks within {near:.2g} px (rms {rms:.2f}); RA "
-        f"{plane.ra:.4f}, Dec {plane.dec:.4f} degrees, {plane.pixel_scale:.3f} "
-        f"arcsec per pixel, position angle {plane.position_angle:.2f} degrees, {seen}"
-    )
-    return Pose(plane, matched, rms, message)
+    return moved(TangentPlane(flat.ra, flat.dec, rows(matrix), (b.real, b.imag)))

@@ -145,7 +145,8 @@ class SkySettings(Section):
     """`[sky]`: where the frame points, for a catalogue with ra and dec.
 
     The pose is searched for within 1 degree of the pointing and 5 % of the scale. Without them the
-    coordinate system in the frame's header is used in their place.
+    coordinate system in the frame's header is used in their place. Where a symmetric catalogue fits
+    as well otherwise, angle and parity have to be given, or be the header's within 5 degrees.
 
     Attributes
     ----------
