@@ -148,26 +148,27 @@ def find_psf(
     with one_blas_thread():
         if start is not None and start.nodes is not None:
             return _measured_at_nodes(posterior, start)
-        begin = start or _start(posterior, estimate, float(oversampling), degree)
-        equations = solved(posterior, begin)
+        rough = nodes > 0  # then what does not vary is where another search begins
+        begin = start or _start(posterior, estimate, float(oversampling), degree, rough=rough)
+        equations = solved(posterior, begin, rough=rough)
         if not equations.state.grid.wings:
             wider = _with_wings(posterior, equations.state)
             if _light_beyond(posterior, wider) > WINGS_SEEN:
-                equations = solved(posterior, wider)
+                equations = solved(posterior, wider, exact=False, rough=rough)
         if nodes:
             return _measured_at_nodes(posterior, equations.state.with_nodes(nodes))
         return _measured(posterior, equations)
 
 
 def _start(
-    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int
+    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int, *, rough: bool
 ) -> PsfState:
     """Where the search begins: a PSF that does not vary tells which grids it needs."""
     grid = starting_grid(posterior, estimate, oversampling, degree)
     if grid.oversampling == oversampling:
         return starting_state(posterior, estimate, grid)
     constant = starting_state(posterior, estimate, replace(grid, degree=0))
-    known = solved(posterior, constant).state
+    known = solved(posterior, constant, rough=rough).state
     suited = suited_grid(grid, known, oversampling)
     if suited is grid and degree == 0:
         return known
@@ -177,7 +178,9 @@ def _start(
     )  # fmt: skip
 
 
-def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
+def solved(
+    posterior: Posterior, state: PsfState, *, exact: bool = True, rough: bool = False
+) -> PsfEquations:
     """The equations where their solution is.
 
     Parameters
@@ -185,6 +188,10 @@ def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
     posterior : Posterior
     state : PsfState
         Where to begin.
+    exact : bool
+        Take the model to be exact in the first turns.
+    rough : bool
+        Be content with a state that is, on average, a standard deviation away.
 
     Returns
     -------
@@ -195,15 +202,15 @@ def solved(posterior: Posterior, state: PsfState) -> PsfEquations:
     InputError
         If no solution is found.
     """
-    exact, close = True, False
+    close = False
     for turn in range(TURNS):
         equations = PsfEquations.of(posterior, state, exact=exact)
         # strengths that are iterated until they rest are the same whatever the start
         equations = equations.with_strengths(CHOOSING if close else 1)
         far = _far(equations)
-        if far < STILL and not exact:
-            return equations
         close = far < equations.pull.size
+        if not exact and (far < STILL or (close and rough)):
+            return equations
         if close and not exact:
             equations = _followed(posterior, equations)
         state = _moved(posterior, equations.state, _change(equations))

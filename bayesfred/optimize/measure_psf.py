@@ -26,7 +26,7 @@ from bayesfred.optimize.psf_marginal import (
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
-FEW = 0.05  # of the sources, which may be lost so
+FEW = 0.1  # of the sources, which may be lost so
 
 
 def measure_psf(
@@ -87,7 +87,7 @@ def measure_psf(
     """
     given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
     psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes)
-    bare, top = _near(posterior, estimate, (psf, state), model_error, given)
+    bare, top = _near(posterior, (psf, state), model_error, given)
     # single sharp pixels hide no others
     rounds = ROUNDS if bare.nuisances.model_error else 1
     for _ in range(rounds if reject_outliers else 0):
@@ -96,7 +96,7 @@ def measure_psf(
             break
         posterior = replace(posterior, mask=kept, extrapolation=None)
         psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, state)
-        bare, top = _near(posterior, estimate, (psf, state), model_error, given)
+        bare, top = _near(posterior, (psf, state), model_error, given)
     if nodes:
         slopes = node_slopes(bare, state, top.params)
     elif bare.model.optics().translates:
@@ -126,7 +126,6 @@ def _explained(posterior: Posterior, params: Floats) -> Flags:
 
 def _near(
     posterior: Posterior,
-    estimate: MapEstimate,
     found: tuple[MeasuredPSF, PsfState],
     model_error: bool,
     prior: Mapping[str, Any],
@@ -134,7 +133,7 @@ def _near(
     """The posterior with a PSF but without the PSF's errors, and its maximum."""
     psf, state = found
     bare = posterior.with_psf(psf)
-    known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
+    known = dict(zip(posterior.parameter_names, state.params, strict=True))
     if model_error:
         bare = replace(
             bare, nuisances=replace(bare.nuisances, model_error=True), prior={**bare.prior, **prior}

@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.model.posterior import Posterior
+from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.growing_disk import PREDICTED, maximize_outward, with_density
 from bayesfred.optimize.matching import Field, lost, match
 from bayesfred.optimize.newton import maximize
@@ -39,6 +40,7 @@ class Start(NamedTuple):
     matched: int
 
 
+@one_blas_thread()  # matrices too small to be shared
 def find_start(posterior: Posterior) -> Start:
     """Parameters from which a search finds the maximum.
 

@@ -177,9 +177,10 @@ class MeasuredPSF:
         one = self.profile
         if not self.varies:
             return one
-        c = np.tensordot(self.terms(x, y), self.coefficients, 1) / self.oversampling**2
         edges = [(0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)]
-        return spline_profile(one.norm, np.pad(c, edges), one.scale, one.stride)
+        c = np.pad(self.coefficients, edges) / self.oversampling**2
+        c = np.tensordot(self.terms(x, y), c, 1)
+        return spline_profile(one.norm, c, one.scale, one.stride)
 
     def terms(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
         """The field's terms at positions on it (pixel), shape (n, terms)."""

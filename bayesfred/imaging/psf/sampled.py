@@ -125,14 +125,17 @@ def spline_profile(norm: float, c: Floats, scale: float, stride: int) -> Any:
     SplineProfile or FieldProfile
     """
     beside = min(LANES * stride, MOST_SAMPLES)  # zeros, so that a row ends with whole vectors
-    wide = np.pad(c, [(0, 0)] * (c.ndim - 1) + [(beside, beside)])
-    n = wide.shape[-1]
+    n = c.shape[-1] + 2 * beside
     among = -(-n // stride)  # coefficients of a phase in a row
     columns = np.arange(n) % stride * among + np.arange(n) // stride
-    rows = np.zeros((*c.shape[:-1], stride * among))
-    rows[..., columns] = wide
-    every = rows.reshape(*c.shape[:-2], -1)
-    padded = np.pad(every, [(0, 0)] * (c.ndim - 2) + [(0, LANES)])
+    size = c.shape[-2] * stride * among
+    padded = np.zeros((*c.shape[:-2], size + LANES))
+    phases = padded[..., :size].reshape(*c.shape[:-1], stride, among)
+    for phase in range(stride):
+        first = (phase - beside) % stride
+        own = c[..., first::stride]
+        begin = (first + beside) // stride
+        phases[..., phase, begin : begin + own.shape[-1]] = own
     family = SplineProfile if c.ndim == 2 else FieldProfile
     return family(norm, c, padded, columns, stride, scale)
 

@@ -16,6 +16,7 @@ Symbols are those of `fluxes.py`. The pixels of a cluster are visited as seldom 
 Where that does not converge, Newton's steps with H in full do, see `fluxes.py`.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -90,18 +91,22 @@ def _least_squares(cluster, s):
 
 
 @leaf()
-def start(cluster):
-    """Templates, and the least-squares flux of every source, its neighbours ignored.
+def start(cluster, level):
+    """Templates, and the most likely flux of every source, its neighbours ignored.
 
-    The prior counts as a measurement of its mean, 2 scale, with its variance, 2 scale^2: a source
-    without pixels, or with a few far in its wings, starts there.
+    Counts are taken to have the variance of the background level, so that log L + log p is
+
+        F A - F^2 B / 2 + a log F - F / c,
+
+    whose maximum is positive, and the prior's for a source without pixels.
     """
     fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
     for s in cluster.group.members:
         make_templates(cluster, s, 1.0)
         above, below = _least_squares(cluster, s)
-        scale = cluster.scale[s]
-        fluxes[s] = max((above + 1.0 / scale) / (below + 0.5 / scale**2), 0.01 * scale)
+        slope, known = above / level - 1.0 / cluster.scale[s], below / level
+        root = math.sqrt(slope * slope + 4.0 * cluster.prior.shape * known)
+        fluxes[s] = 2.0 * cluster.prior.shape / (root - slope)
         for m in range(1, stamps.shape[0]):
             for i in range(fp.start[fp.first[s]], fp.start[fp.first[s + 1]]):
                 stamps[m, i] *= fluxes[s]

@@ -339,7 +339,7 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
             layout, touching, group, patch, canvas, fluxes, shifts, Prior(shape, scatter), scale
         )
         fill_excess(problem.frame, parameters.background, patch)
-        start(cluster)
+        start(cluster, max(parameters.background[0], 1.0))
         if not _climb(problem.frame, parameters, cluster, h):
             return -math.inf
         if np.any(touching.faint[group.members]):
