@@ -14,7 +14,7 @@ from bayesfred.model.psf_errors import OccamFactor, PsfErrors, covariance_of, re
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
-from bayesfred.optimize.newton import NewtonResult, maximize
+from bayesfred.optimize.newton import maximize
 from bayesfred.optimize.outliers import reject_once
 from bayesfred.optimize.psf_equations import LARGEST_ERROR, PsfState
 from bayesfred.optimize.psf_marginal import (
@@ -87,16 +87,23 @@ def measure_psf(
     """
     given = {name: own for name, own in (prior or {}).items() if name == "model_error"}
     psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes)
-    bare, top = _near(posterior, (psf, state), model_error, given)
+    bare, start = _with(posterior, (psf, state), model_error, given)
     # single sharp pixels hide no others
     rounds = ROUNDS if bare.nuisances.model_error else 1
     for _ in range(rounds if reject_outliers else 0):
-        kept = _explained(bare, top.params)
+        kept = _explained(*_as_measured(bare, start, state))
         if np.array_equal(kept, posterior.mask):
             break
         posterior = replace(posterior, mask=kept, extrapolation=None)
         psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, state)
-        bare, top = _near(posterior, (psf, state), model_error, given)
+        bare, start = _with(posterior, (psf, state), model_error, given)
+    if not np.isfinite(bare.log_prob(start)):
+        raise InputError(
+            "psf: got one that explains some source with no flux at all, expected images that "
+            "resemble each other: reject outliers (reject_outliers), mask what is no source's, or "
+            "let the PSF vary less over the field (degree)"
+        )
+    top = maximize(bare, start)
     if nodes:
         slopes = node_slopes(bare, state, top.params)
     elif bare.model.optics().translates:
@@ -124,13 +131,13 @@ def _explained(posterior: Posterior, params: Floats) -> Flags:
     return found.posterior.mask if found.share <= FEW else kept
 
 
-def _near(
+def _with(
     posterior: Posterior,
     found: tuple[MeasuredPSF, PsfState],
     model_error: bool,
     prior: Mapping[str, Any],
-) -> tuple[Posterior, NewtonResult]:
-    """The posterior with a PSF but without the PSF's errors, and its maximum."""
+) -> tuple[Posterior, Floats]:
+    """The posterior with a PSF but without the PSF's errors, and about its maximum."""
     psf, state = found
     bare = posterior.with_psf(psf)
     known = dict(zip(posterior.parameter_names, state.params, strict=True))
@@ -140,15 +147,33 @@ def _near(
         )
     known.setdefault("model_error", min(max(psf.model_error, 1e-3), LARGEST_ERROR))
     start = np.array([known[name] for name in bare.parameter_names])
-    if not np.isfinite(bare.log_prob(start)):
+    if bare.nuisances.model_error:
+        # a source that shows its wings alone has any flux whose error covers what is wrong there
         bare = replace(bare, mask=lit_pixels(posterior, state), extrapolation=None)
-    if not np.isfinite(bare.log_prob(start)):
-        raise InputError(
-            "psf: got one that explains some source with no flux at all, expected images that "
-            "resemble each other: reject outliers (reject_outliers), mask what is no source's, or "
-            "let the PSF vary less over the field (degree)"
-        )
-    return bare, maximize(bare, start)
+    return bare, start
+
+
+def _as_measured(
+    posterior: Posterior, params: Floats, state: PsfState
+) -> tuple[Posterior, Floats]:
+    """A posterior whose fluxes and positions are known, as the PSF was measured with them.
+
+    Beside light that is no source's the most likely flux may be one that is so large that the
+    model's error covers it.
+    """
+    nuisances, sources = posterior.nuisances, posterior.model.sources
+    if nuisances.flux != "free":
+        return posterior, params
+    (dx, dy), known = state.shifts.T, dict(zip(posterior.parameter_names, params, strict=True))
+    sources = replace(sources, x=sources.x + dx, y=sources.y + dy, flux=state.fluxes)
+    measured = replace(
+        posterior,
+        model=replace(posterior.model, sources=sources),
+        nuisances=replace(nuisances, flux="fixed", position_scatter=False),
+        prior={name: own for name, own in posterior.prior.items() if name != "position_scatter"},
+        extrapolation=None,
+    )
+    return measured, np.array([known[name] for name in measured.parameter_names])
 
 
 def marginalize_psf(posterior: Posterior, estimate: MapEstimate) -> Posterior:

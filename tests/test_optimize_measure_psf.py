@@ -1,0 +1,54 @@
+"""Measured PSFs of frames with light that is no source's."""
+
+import numpy as np
+import pytest
+
+import bayesfred as bf
+
+THETA, FLUX, GHOSTS = [1e-3, 0.0], 2e5, 3
+
+
+def frame_with_ghosts(seed: int, flux: float, width: float) -> bf.Posterior:
+    """64 pinholes, three of which have a broad ghost within a few pixels, which no PSF explains."""
+    pinholes, rng = bf.SourceCatalog.grid(8, 16.0, FLUX), np.random.default_rng(seed)
+    lens = bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)])
+    detector = bf.Detector((137, 137), pixel="box")
+    which, angle = rng.choice(64, GHOSTS, replace=False), rng.uniform(0.0, 2.0 * np.pi, GHOSTS)
+    x = pinholes.x[which] + 4.0 * np.cos(angle)
+    y = pinholes.y[which] + 4.0 * np.sin(angle)
+    ghosts = bf.SourceCatalog(x, y, np.full(GHOSTS, flux))
+    mean = bf.ForwardModel(detector, pinholes, bf.MoffatPSF(3.0, 4.0), lens).expected_counts(
+        THETA, 50.0
+    ) + bf.ForwardModel(detector, ghosts, bf.GaussianPSF(width), lens).expected_counts(THETA, 0.0)
+    return bf.Posterior(
+        bf.ForwardModel(detector, pinholes, bf.GaussianPSF(1.3), lens),
+        rng.poisson(mean).astype(float),
+        nuisances=bf.Nuisances(flux="free", offset=True),
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "flux", "width"), [(1, 3e5, 2.5), (2, 3e5, 2.5), (1, 1e6, 2.5), (2, 1e6, 4.0)]
+)
+def test_a_ghost_beside_a_source_runs_away_with_nothing(
+    seed: int, flux: float, width: float
+) -> None:
+    """Once the error was 0.6 of the light and a flux 100 times the others', or there was no PSF.
+
+    The ghost would be explained by a model error that a large flux makes large.
+    """
+    posterior = frame_with_ghosts(seed, flux, width)
+    found, estimate = bf.measure_psf(
+        posterior, bf.find_map(posterior), model_error=True, reject_outliers=True
+    )
+    known = dict(zip(found.parameter_names, estimate.params, strict=True))
+    sd = dict(zip(found.parameter_names, np.sqrt(np.diag(estimate.covariance)), strict=True))
+    assert known["model_error"] < 0.01
+    off = [
+        (known[name] - value) / sd[name] for name, value in zip(("f_x", "g_y"), THETA, strict=True)
+    ]
+    assert np.abs(off).max() < 4.5  # of 8 numbers in all
+    assert sd["f_x"] < 3e-5
+    assert found.likelihood.fluxes(estimate.params).max() < 5.0 * FLUX  # of one that is masked
+    # what is left of broad ghosts is said
+    assert estimate.fits_data == (width < 3.0)
