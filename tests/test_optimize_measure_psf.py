@@ -1,9 +1,13 @@
 """Measured PSFs of frames with light that is no source's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import bayesfred as bf
+from bayesfred.optimize.measure_psf import psf_message
+from bayesfred.optimize.psf_samples import likely_error
 
 THETA, FLUX, GHOSTS = [1e-3, 0.0], 2e5, 3
 
@@ -52,3 +56,30 @@ def test_a_ghost_beside_a_source_runs_away_with_nothing(
     assert found.likelihood.fluxes(estimate.params).max() < 5.0 * FLUX  # of one that is masked
     # what is left of broad ghosts is said
     assert estimate.fits_data == (width < 3.0)
+
+
+def test_a_wrong_background_is_no_error_of_the_light():
+    """Of 1,000 bright pixels and 50,000 faint ones, whose background is off by two deviations."""
+    rng, error = np.random.default_rng(1), 0.05
+    light = np.concatenate([np.full(1000, 2000.0), np.full(50_000, 1.0)])
+    variance = light + 100.0
+    residual = rng.normal(size=light.size) * np.sqrt(variance + (error * light) ** 2)
+    residual[1000:] += 20.0
+    found = likely_error(residual, variance, light)
+    assert abs(found - error) < 5.0 * error / np.sqrt(2.0 * 1000)
+    assert likely_error(residual[1000:], variance[1000:], light[1000:]) == 0.0
+
+
+def test_a_psf_that_leaves_much_should_vary_more():
+    posterior = frame_with_ghosts(1, 3e5, 2.5)
+    known = dict(zip(posterior.parameter_names, bf.find_map(posterior).params, strict=True))
+    coefficients = np.zeros((1, 9, 9))
+    coefficients[0, 3:6, 3:6] = 4.0 / 9.0
+    posterior = replace(
+        posterior.with_psf(bf.MeasuredPSF(coefficients, 2.0, 80.0)),
+        nuisances=replace(posterior.nuisances, model_error=True),
+    )
+    for error, said in ((0.05, "5.0% of the light unexplained"), (0.2, "(psf.degree = 2)")):
+        params = np.array([{**known, "model_error": error}[n] for n in posterior.parameter_names])
+        estimate = bf.find_map(posterior, params)
+        assert psf_message(posterior, replace(estimate, params=params)).endswith(said)

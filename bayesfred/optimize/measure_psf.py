@@ -27,6 +27,8 @@ from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
 FEW = 0.1  # of the sources, which may be lost so
+MOST = 4  # a degree, beyond which the equations of a PSF take minutes
+NODES, EACH = 7, 10  # a number of nodes, and of the sources at each that they take
 
 
 def measure_psf(
@@ -153,9 +155,7 @@ def _with(
     return bare, start
 
 
-def _as_measured(
-    posterior: Posterior, params: Floats, state: PsfState
-) -> tuple[Posterior, Floats]:
+def _as_measured(posterior: Posterior, params: Floats, state: PsfState) -> tuple[Posterior, Floats]:
     """A posterior whose fluxes and positions are known, as the PSF was measured with them.
 
     Beside light that is no source's the most likely flux may be one that is so large that the
@@ -243,10 +243,27 @@ def psf_message(posterior: Posterior, estimate: MapEstimate) -> str:
     known = dict(zip(posterior.parameter_names, estimate.params, strict=True))
     error = known.get("model_error", psf.model_error)
     left = f", {error:.1%} of the light unexplained" if error else ""
+    if error > LARGEST_ERROR:
+        left += f": {varying_more(posterior)}"
     return (
         f"psf: measured{here}, FWHM {FWHM * psf.sigma:.2f} pixel with the pixel in it{varies}, "
         f"{psf.determined:.0f} numbers determined{left}"
     )
+
+
+def varying_more(posterior: Posterior) -> str:
+    """What to do where a measured PSF is not good enough; empty of a PSF that was not measured."""
+    psf, sources = posterior.model.psf, len(posterior.model.sources)
+    if not isinstance(psf, MeasuredPSF):
+        return ""
+    if psf.nodes:
+        more = f"psf.nodes = {psf.nodes + 4}"
+    elif psf.degree >= MOST or sources >= EACH * NODES**2:
+        more = f"psf.nodes = {NODES}"
+    else:
+        more = f"psf.degree = {psf.degree + 2}"
+    instead = " in place of psf.degree" if psf.degree and "nodes" in more else ""
+    return f"let the PSF vary more over the field ({more}{instead})"
 
 
 def _slopes(posterior: Posterior, psf: MeasuredPSF, centre: Floats) -> Floats:

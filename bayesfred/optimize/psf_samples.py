@@ -205,6 +205,9 @@ def template_pulls(data: PsfSamples, templates: Floats, score: Floats, sources: 
 def likely_error(residual: Floats, variance: Floats, light: Floats) -> float:
     """The most likely share of the light by which the model is off; 0 if the noise explains all.
 
+    Of the pixels in which the light exceeds the noise: what else is wrong in the others, such as
+    the background, would make it many times the light.
+
     Parameters
     ----------
     residual, variance, light : ndarray, shape (pixels,)
@@ -213,6 +216,8 @@ def likely_error(residual: Floats, variance: Floats, light: Floats) -> float:
     -------
     float
     """
+    seen = light**2 > variance
+    residual, variance, light = residual[seen], variance[seen], light[seen]
 
     def excess(error: float) -> float:
         total = variance + (error * light) ** 2
@@ -220,6 +225,6 @@ def likely_error(residual: Floats, variance: Floats, light: Floats) -> float:
         return float(np.sum(light**2 / total * (z - 1.0)))
 
     # the score of the squared error, in its standard deviations
-    if excess(0.0) < 3.0 * math.sqrt(2.0 * float(np.sum((light**2 / variance) ** 2))):
+    if excess(0.0) <= 3.0 * math.sqrt(2.0 * float(np.sum((light**2 / variance) ** 2))):
         return 0.0
     return float(brentq(excess, 0.0, 10.0, xtol=1e-4)) if excess(10.0) < 0.0 else 10.0

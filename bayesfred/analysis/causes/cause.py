@@ -2,13 +2,10 @@
 
 from dataclasses import dataclass
 
-from bayesfred.imaging.psf import MeasuredPSF
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.measure_psf import varying_more
 
 RICHER = 0.9  # weight of a hypothesis that contains others
-
-MOST = 4  # a degree, beyond which the equations of a PSF take minutes
-NODES = 7
 
 
 @dataclass(frozen=True)
@@ -69,13 +66,4 @@ def scatter_remedy(posterior: Posterior) -> str:
 
 def psf_remedy(posterior: Posterior, other: str) -> str:
     """What to do about a wrong PSF: of a measured one, and of any other."""
-    psf = posterior.model.psf
-    if not isinstance(psf, MeasuredPSF):
-        return other
-    if psf.nodes:
-        more = f"psf.nodes = {psf.nodes + 4}"
-    elif psf.degree < MOST:
-        more = f"psf.degree = {psf.degree + 2}"
-    else:
-        more = f"psf.nodes = {NODES} in place of psf.degree"
-    return f"let the PSF vary more over the field ({more})"
+    return varying_more(posterior) or other
