@@ -346,14 +346,6 @@ def test_wrong_model_is_seen_and_masked_pixels_are_not() -> None:
     assert good.n_pixels == 35 * 40 and good.n_fitted == 2
 
 
-@pytest.mark.parametrize(("scatter", "fitted"), [(False, 9), (True, 23)])
-def test_what_is_free_of_a_source_counts_as_fitted(scatter: bool, fitted: int) -> None:
-    posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
-    posterior.nuisances = Nuisances("free", position_scatter=scatter)
-    posterior.model.sources.flux = np.ones(7)
-    assert diagnose(chain_at(np.array([1.0, 5.0]), posterior)).n_fitted == fitted
-
-
 def test_a_varying_background_has_no_paper_statistic() -> None:
     posterior = linear_posterior(np.full(SHAPE, 5.0), PoissonNoise())
     posterior.nuisances = Nuisances(background_order=1)

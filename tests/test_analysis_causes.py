@@ -99,6 +99,17 @@ def test_no_remedy_is_one_that_the_run_file_has(name: str) -> None:
         assert verdict.causes[0].remedy
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.4])
+def test_the_verdict_says_of_a_large_model_error_that_it_is_one(factor: float) -> None:
+    """A model that needs it fits the counts, and nothing else would tell of the PSF."""
+    posterior = planted.true(1)
+    wrong = posterior.with_psf(GaussianPSF(factor * posterior.model.psf.sigma))
+    verdict = judged(replace(wrong, nuisances=replace(wrong.nuisances, model_error=True)))
+    assert verdict.fits_data or factor > 1.0
+    assert ("of the light unexplained" in verdict.omitted) == (factor > 1.0)
+    assert ("psf.kind" in verdict.omitted) == (factor > 1.0)
+
+
 def test_remedies_are_those_that_a_run_can_take() -> None:
     """Of positions that scatter with free fluxes, and of a PSF that was measured."""
     posterior = planted.true(1, flux="free")

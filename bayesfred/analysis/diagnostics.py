@@ -93,7 +93,8 @@ class Diagnostics:
     n_pixels : int
         Pixels that enter the likelihood.
     n_fitted : int
-        Fitted numbers: parameters, and every source's flux and position where these are free.
+        Fitted numbers: parameters, and where they are free the fluxes and positions of sources, as
+        many as the counts determine; a measured PSF's, too.
     background_estimate : float
         The paper's lambda-hat, counts per pixel: mean of counts less the source image. nan unless
         the background is a constant.

@@ -42,11 +42,10 @@ from bayesfred.io.summary_table import Table, make_table
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.sources import OwnPixels, fit_templates
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.source_numbers import own_radius
 
 __all__ = ["SourceFits", "fit_sources", "source_table", "tabulate"]
 
-WIDTHS = 3.0  # radius of a source's own pixels, in widths of the PSF
-REACH = 0.75  # pixel, added so that the pixel of the image's middle is always among them
 SIGNIFICANT = 3.0  # standard deviations of light without which nothing is said of its place
 ALONE = 0.01  # share of a source's light that others may have among its pixels
 BLOCK = 2**18  # samples
@@ -166,10 +165,8 @@ def fit_sources(posterior: Posterior, params: Floats) -> SourceFits:
     -------
     SourceFits
     """
-    model = posterior.model
     named = dict(zip(posterior.parameter_names, np.asarray(params).tolist(), strict=True))
-    sigma = named.get("psf_sigma", model.psf.sigma)
-    radius = WIDTHS * sigma + REACH * float(model.detector.binning)
+    radius = own_radius(posterior, np.asarray(params))
     own, expected, fluxes, shifts = posterior.likelihood.own_pixels(params, radius)
     owner = np.repeat(np.arange(fluxes.size), np.diff(own.first))
     sums = _sum_up(posterior, (own, owner), expected.ravel(), np.asarray(params))

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.causes import Cause, find_causes, hidden_causes
+from bayesfred.analysis.causes.cause import psf_remedy
 from bayesfred.analysis.residuals import Residuals
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
@@ -35,6 +36,7 @@ LEAST_MODE = 0.01  # share of the draws from which a mode is told of
 HARDLY = 0.1  # share of its weight below which a source far off its position is named
 MOST_NAMED = 10
 WIDER = 1.1  # factor of the errors from which it is said
+CHECKED = 0.04  # model error up to which refits of simulated frames confirm the errors
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,8 @@ def judge_fit(
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
     sentence += _far_off(residuals)
-    return FitVerdict(fits, causes, sentence, _omitted(posterior, fit, fits), unmatched)
+    omitted = _omitted(posterior, fit, fits) + _unexplained(posterior, params)
+    return FitVerdict(fits, causes, sentence, omitted, unmatched)
 
 
 def judge_sampling(
@@ -312,3 +315,17 @@ def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
     if fits or not WIDER < factor < np.inf:
         return f"{sentence}{'' if fits else ', and the misfit'}."
     return f"{sentence}, and the misfit: as mere noise it would make them {factor:.2g} times wider."
+
+
+def _unexplained(posterior: Any, params: Floats) -> str:
+    """Say of a large model error that it is one."""
+    if not posterior.nuisances.model_error:
+        return ""
+    error = float(params[posterior.parameter_names.index("model_error")])
+    if error <= CHECKED:
+        return ""
+    remedy = psf_remedy(posterior, 'measure it on the frame (psf.kind = "measured")')
+    return (
+        f" The PSF leaves {error:.0%} of the light unexplained, and errors were checked up to "
+        f"{CHECKED:.0%}: {remedy}, or test them with bayesfred crosscheck."
+    )

@@ -15,11 +15,11 @@ what a fit can remove: every model of this package fits a background, whose scor
     sum v_i - (sum c_i)^2 / (sum 1/mu_i),
 
 for Pearson 2 N instead of the N (2 + 1/mu) of a known mean: at 0.01 counts a pixel the two standard
-deviations differ by a factor 7. Each fitted number lowers the expectation by one. Where the paper's
-noise is fitted, a Gaussian of mean and variance lambda to counts that are Poisson, the same
-argument for the score of lambda, A / lambda + B / (2 lambda^2) with A = sum r, B = sum (r^2 -
-lambda), leaves Pearson's statistic (B - A) / (lambda + 1/2), of variance 2 N (lambda / (lambda +
-1/2))^2.
+deviations differ by a factor 7. Each fitted number lowers the expectation by one, and one that a
+prior holds too by less (`bayesfred.optimize.source_numbers`). Where the paper's noise is fitted, a
+Gaussian of mean and variance lambda to counts that are Poisson, the same argument for the score of
+lambda, A / lambda + B / (2 lambda^2) with A = sum r, B = sum (r^2 - lambda), leaves Pearson's
+statistic (B - A) / (lambda + 1/2), of variance 2 N (lambda / (lambda + 1/2))^2.
 
 References
 ----------
@@ -38,6 +38,7 @@ from bayesfred._typing import Floats
 from bayesfred.model.likelihood import Expected
 from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.source_numbers import determined_numbers
 
 BLOCK = 2**16  # pixels
 PART = 2**21  # pixels of a frame that are gathered at once
@@ -51,10 +52,6 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     """The numbers that judge a fit, by the names that `Diagnostics` gives them."""
     level = float(params[posterior.parameter_names.index("background")])
     background = level if posterior.nuisances.background_order == 0 else math.nan
-    profiled = posterior.nuisances.profiled * posterior.model.sources.flux.size
-    fitted = posterior.n_parameters + profiled
-    if posterior.psf_errors is not None:
-        fitted += round(posterior.psf_errors.absorbed)
     noise, sums, moments = posterior.noise_at(params), np.zeros(7), np.zeros(3)
     # a mean of zero makes a statistic infinite, which is its value
     with posterior.likelihood.expected(params) as expected, np.errstate(all="ignore"):
@@ -72,6 +69,8 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
         # a fitted background removes the part that is linear in the counts: see the head of the
         # module
         left = variance - slope**2 / np.float64(inverse)
+        folded = bool(np.isnan(expected.fluxes).any())
+    fitted = _fitted(posterior, params, folded=folded)
     scaled = float(moments[2] / number / estimate) if estimate > 0.0 else math.nan
     return {
         "n_pixels": number,
@@ -85,6 +84,16 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
         "deviance_expected": mean - fitted,
         "deviance_sd": float(np.sqrt(left)),
     }
+
+
+def _fitted(posterior: Posterior, params: Floats, *, folded: bool) -> int:
+    """How many numbers the fit takes from the counts."""
+    fitted = float(posterior.n_parameters)
+    if posterior.nuisances.profiled and not folded:
+        fitted += determined_numbers(posterior, params)
+    if posterior.psf_errors is not None:
+        fitted += posterior.psf_errors.absorbed
+    return round(fitted)
 
 
 def _parts(
