@@ -7,8 +7,8 @@ https://github.com/esa/tetra3. Both are fitted as `bayesfred fit` does, into cha
 the four cubic terms x^3 and x y^2 of u, x^2 y and y^3 of v equal; they are printed in pixels at 512
 pixels from the middle, as displacement of the star (minus the coefficient of f or g).
 
-The exit code is 3: the stars are no Gaussians, so the model does not fit the counts, and the error
-bars cannot be trusted.
+The exit code is 3 where a verdict is "not trustworthy". The model fits the counts, but the measured
+PSF leaves 16 % of the light unexplained: the verdict says so.
 """
 
 import csv

@@ -7,8 +7,8 @@ an hour each), into chains/, and its calibration is written there as a FITS head
 Then the header's positions of the catalogue's stars are held against centroids: least-squares
 Gaussians, which know nothing of the fit. A lens makes the four cubic terms x^3 and x y^2 of u,
 x^2 y and y^3 of v equal: their mean is printed in pixels at 512 pixels from the middle, frame by
-frame. The verdict is "not trustworthy": background and faint stars, which the catalogue lacks, are
-no polynomial.
+frame. Without --sample the verdict is "not trustworthy": the posterior is not normal, as the
+scatter of the positions is next to zero.
 """
 
 import sys

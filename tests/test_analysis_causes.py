@@ -99,6 +99,18 @@ def test_no_remedy_is_one_that_the_run_file_has(name: str) -> None:
         assert verdict.causes[0].remedy
 
 
+@pytest.mark.parametrize("steepness", [0.1, 0.7])
+def test_an_uneven_background_is_stated_without_its_noise(steepness: float) -> None:
+    """The root mean square of a slope across the frame, which the model takes for flat."""
+    true = planted.true(1)
+    slope = planted.LEVEL * steepness * np.linspace(-1.0, 1.0, planted.SHAPE[1])
+    more = np.random.default_rng(1).poisson(slope + planted.LEVEL * steepness, planted.SHAPE)
+    cause = judged(replace(true, counts=true.counts + more)).causes[0]
+    assert cause.name == "background"
+    stated = float(cause.sentence.split("model's by ")[1].split()[0])
+    assert stated == pytest.approx(slope.std(), rel=0.25)
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.4])
 def test_the_verdict_says_of_a_large_model_error_that_it_is_one(factor: float) -> None:
     """A model that needs it fits the counts, and nothing else would tell of the PSF."""

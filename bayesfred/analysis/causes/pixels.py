@@ -137,12 +137,13 @@ def _background(
     root = np.sqrt(size)
     found, *_ = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)
     smooth = float(np.sum((root * (design @ found)) ** 2))
-    by = float(np.ptp(mean) * np.median(context.variance[context.used]) ** 0.5)
+    excess = held / float(np.sum(size))  # of what the noise of so few pixels makes of the means
+    by = float((excess * np.median(context.variance[context.used])) ** 0.5)
     mends = order < 2 and smooth > 0.5 * held
     cause = Cause(
         "background", 0.0,
-        f"the background between the sources differs from the model's by up to {by:.2g} counts a "
-        "pixel from one part of the frame to another",
+        f"the background between the sources differs from the model's by {by:.2g} counts a pixel "
+        "(root mean square), from one part of the frame to another",
         f"set nuisances.background_order = {2 if order or len(mean) > 20 else 1}" if mends else
         "subtract a background first, or mask what is not background",
     )  # fmt: skip
