@@ -41,6 +41,7 @@ pixel = "box"
 [psf]
 kind = "measured"  # on the frame's own sources
 sigma = {sigma:.2g}  # pixels, a start: by the brightest peaks
+# degree = 1  # where the PSF varies over the field; of hundreds of sources nodes = 7 instead
 
 [distortion]
 terms = "polynomial"
