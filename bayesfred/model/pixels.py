@@ -124,9 +124,11 @@ def padded_frame(counts: Floats, mask: Flags, noise: Noise, nuisances: Nuisances
     np.copyto(values[:, :nx], counts, where=mask)
     used = (values > LIMIT).reshape(-1, SEGMENT)
     total = values.reshape(-1, SEGMENT).sum(axis=1, where=used)
-    terms = base = noise.terms(values)
     if nuisances.model_error:
         terms = model_error_terms(noise, values, counts, mask)
+        base = terms.base
+    else:
+        terms = base = noise.terms(values)
     varies = nuisances.background_order > 0
     return Frame(
         values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),

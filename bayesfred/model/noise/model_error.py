@@ -142,8 +142,7 @@ class ModelErrorTerms(NamedTuple):
 def model_error_terms(noise: Noise, values: Floats, counts: Floats, used: Flags) -> ModelErrorTerms:
     """The compiled half of a noise with a model error, for a frame of padded rows."""
     highest = np.zeros(values.shape)
-    found = np.asarray(noise.highest(np.where(used, counts, 1.0)))
-    highest[:, : counts.shape[1]] = np.where(used, found, 0.0)
+    highest[:, : counts.shape[1]][used] = noise.at(used).highest(counts[used])
     return ModelErrorTerms(noise.terms(values), 0.0, highest.ravel())
 
 
