@@ -13,6 +13,10 @@ drew it to itself. With I_s the information of its pixels and H = R^-1 R^-T, u_s
 model the covariance I_s - I_s H^-1 I_s. So in units of R, where I_s is M = R^T I_s R, it is
 multiplied by (1 - M)^-1/2, which makes the sandwich of a true model H^-1 I H^-1 on average.
 
+The errors of a measured PSF are in the covariance, but in no source's u_s: H is then that of a
+known PSF. In units of R the sandwich tells how much farther the maximum scatters than it should.
+The covariance R' R'^T with the PSF's errors becomes that many times larger: R' is put in R's place.
+
 It holds for errors that are independent from source to source. It does not know of those that all
 share, such as a PSF that is too wide: these displace theta and leave no scatter. Of few sources it
 is itself uncertain, by a share of some (2 n)^-1/2.
@@ -32,8 +36,9 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.absorbed import absorbed
 from bayesfred.analysis.folds import fold_sources
 from bayesfred.analysis.sources import SourceFits, fit_sources
-from bayesfred.model.parameters import BACKGROUND_POWERS
+from bayesfred.model.parameters import BACKGROUND_POWERS, SCALES
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.estimate import inverse
 
 __all__ = ["robust_sd"]
 
@@ -50,13 +55,13 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     params : ndarray, shape (d,)
         The MAP.
     covariance : ndarray, shape (d, d)
-        Inverse of information and prior curvature there.
+        Inverse of information and prior curvature there, with the errors of a measured PSF.
 
     Returns
     -------
     ndarray, shape (d,), parameter units
-        nan with fewer than two sources in the frame, and of `position_scatter`, of which no single
-        source tells.
+        nan with fewer than two sources in the frame, and of `position_scatter` and `model_error`,
+        of which no single source tells.
     """
     fits = fit_sources(posterior, params)
     number, shape = fits.fluxes.size, fits.expected.shape
@@ -69,9 +74,10 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     level = float(params[posterior.parameter_names.index("background")])
     residual = (posterior.counts - fits.expected).ravel()[order]
     weight = 1.0 / posterior.noise_at(params).counts_variance(fits.expected, level).ravel()[order]
-    # in units in which the covariance is 1
-    root = np.linalg.cholesky(covariance)
-    response = absorbed(posterior, params, covariance, fits).response @ root
+    measured = posterior.psf_errors is not None
+    known = inverse(posterior.information(params)) if measured else covariance
+    root = np.linalg.cholesky(known)  # units in which this covariance is 1
+    response = absorbed(posterior, params, known, fits).response @ root
     response = response.swapaxes(0, 1).reshape(-1, params.size)  # by template, then by source
     light = _by_pixel(fits, owner.size)[order]
     names = posterior.nuisances.background_names
@@ -85,8 +91,8 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
         values, vectors = np.linalg.eigh(jacobian.T @ weighted)
         share = np.minimum(values, DECISIVE)
         scores[k] = vectors @ ((vectors.T @ (weighted.T @ residual[own])) / np.sqrt(1.0 - share))
-    sd = np.sqrt(np.sum((scores @ root.T) ** 2, axis=0))
-    return np.where(np.isin(posterior.parameter_names, posterior.hyperparameters), np.nan, sd)
+    sd = np.sqrt(np.sum((scores @ np.linalg.cholesky(covariance).T) ** 2, axis=0))
+    return np.where(np.isin(posterior.parameter_names, SCALES), np.nan, sd)
 
 
 def _by_pixel(fits: SourceFits, pixels: int) -> sparse.csr_matrix:

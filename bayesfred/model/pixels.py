@@ -124,16 +124,15 @@ def padded_frame(counts: Floats, mask: Flags, noise: Noise, nuisances: Nuisances
     np.copyto(values[:, :nx], counts, where=mask)
     used = (values > LIMIT).reshape(-1, SEGMENT)
     total = values.reshape(-1, SEGMENT).sum(axis=1, where=used)
+    varies, terms = nuisances.background_order > 0, noise.terms(values)
+    everywhere = varies or not hasattr(terms, "unreached")
+    if not everywhere:
+        terms = noise.with_unreached(terms, values)
     if nuisances.model_error:
-        terms = model_error_terms(noise, values, counts, mask)
-        base = terms.base
-    else:
-        terms = base = noise.terms(values)
-    varies = nuisances.background_order > 0
+        terms = model_error_terms(noise, terms, stride(nx), counts, mask)
     return Frame(
         values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
-        float(total.sum()), ny, nx, terms, varies,
-        everywhere=varies or not hasattr(base, "unreached"),
+        float(total.sum()), ny, nx, terms, varies, everywhere,
     )  # fmt: skip
 
 

@@ -151,9 +151,11 @@ class FlatFieldNoise(Noise):
         response = np.ones(values.shape)
         response[:, : self.response.shape[1]] = self.response
         counts = np.where(values > LIMIT, values * response, MASKED)
-        terms = FlatFieldTerms(
+        return FlatFieldTerms(
             self.noise.terms(counts), counts.ravel(), response.ravel(), no_series()
         )
+
+    def with_unreached(self, terms: FlatFieldTerms, values: Floats) -> FlatFieldTerms:
         variance = float(np.median(np.square(self.noise.read_noise)))
         return terms._replace(level=level_series(terms, values, variance))
 

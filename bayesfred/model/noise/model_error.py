@@ -139,11 +139,13 @@ class ModelErrorTerms(NamedTuple):
         )  # fmt: skip
 
 
-def model_error_terms(noise: Noise, values: Floats, counts: Floats, used: Flags) -> ModelErrorTerms:
-    """The compiled half of a noise with a model error, for a frame of padded rows."""
-    highest = np.zeros(values.shape)
+def model_error_terms(
+    noise: Noise, base: Any, pitch: int, counts: Floats, used: Flags
+) -> ModelErrorTerms:
+    """The compiled half of a noise, `base`, with a model error, for a frame of padded rows."""
+    highest = np.zeros((len(counts), pitch))
     highest[:, : counts.shape[1]][used] = noise.at(used).highest(counts[used])
-    return ModelErrorTerms(noise.terms(values), 0.0, highest.ravel())
+    return ModelErrorTerms(base, 0.0, highest.ravel())
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,6 @@ from bayesfred.model.kernels.read_noise import (
     alike_pixels,
     frame_steps,
     informations,
-    level_series,
     log_densities,
     most_likely,
     new_terms,
@@ -173,14 +172,13 @@ def _moments(means: Floats, r: float) -> Floats:
 def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     """The compiled half for a frame of padded rows."""
     terms = _terms(read_noise)
-    level = level_series(terms, values, float(np.median(np.square(read_noise))))
     if isinstance(read_noise, float):
-        terms = terms._replace(cumulants=cumulant_table(read_noise**2, values, SEGMENT))
-    elif len(terms.kind) == 2:
-        terms = terms._replace(alike=alike_pixels(values, read_noise**2))
-    elif len(terms.kind) == 0:
-        terms = terms._replace(steps=frame_steps(values, read_noise**2))
-    return terms._replace(level=level)
+        return terms._replace(cumulants=cumulant_table(read_noise**2, values, SEGMENT))
+    if len(terms.kind) == 2:
+        return terms._replace(alike=alike_pixels(values, read_noise**2))
+    if len(terms.kind) == 0:
+        return terms._replace(steps=frame_steps(values, read_noise**2))
+    return terms
 
 
 def _terms(read_noise: float | Floats) -> ReadNoiseTerms:

@@ -16,7 +16,7 @@ from bayesfred.imaging.kernels.fastmath import log
 from bayesfred.io.serialize import serializable
 from bayesfred.model.kernels.contexts import MASKED
 from bayesfred.model.kernels.poisson_gaussian import left_out
-from bayesfred.model.kernels.read_noise import ReadNoiseTerms
+from bayesfred.model.kernels.read_noise import ReadNoiseTerms, level_series
 from bayesfred.model.noise.moments import (
     deviance,
     frame_terms,
@@ -157,6 +157,12 @@ class PoissonNoise(Noise):
         padded = np.full(values.shape, np.median(self.read_noise))
         padded[:, : self.read_noise.shape[1]] = self.read_noise
         return frame_terms(padded.ravel(), values)
+
+    def with_unreached(self, terms: Any, values: Floats) -> Any:
+        if self.discrete:
+            return terms
+        level = level_series(terms, values, float(np.median(self._variance)))
+        return terms._replace(level=level)
 
     def constant(self, counts: Floats, used: Flags) -> float:
         if self.discrete:

@@ -31,6 +31,10 @@ class Noise(Protocol):
     def terms(self, values: Floats) -> Any:
         """The compiled half for a frame of padded rows, MASKED where a pixel is not used."""
 
+    def with_unreached(self, terms: Any, values: Floats) -> Any:
+        """That compiled half with what its `unreached` needs, where it is asked at all."""
+        return terms
+
     def constant(self, counts: Floats, used: Flags) -> float:
         """The part of the log-likelihood that depends on the counts alone, for the pixels in use.
 
