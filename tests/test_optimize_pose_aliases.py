@@ -126,6 +126,20 @@ def test_places_tell() -> None:
         assert off(pose.plane, truth) < 6.0
 
 
+def test_several_holes_tell() -> None:
+    """An alias has peaks without stars there, and stars without peaks elsewhere."""
+    for seed in range(5):
+        at = grid(*COUNT["square"])
+        order = np.random.default_rng(seed).permutation(at[0].size)
+        ra, dec = (each[order[5:]] for each in at)
+        pose, truth = posed(seed, (ra, dec), equal((ra, dec)))
+        assert not pose.ambiguous
+        assert off(pose.plane, truth) < 6.0
+        # negative control: a single one may be a star that was missed
+        ra, dec = (each[order[1:]] for each in at)
+        assert posed(seed, (ra, dec), equal((ra, dec)))[0].ambiguous
+
+
 def test_a_grid_wider_than_the_frame_may_be_shifted() -> None:
     at = grid(*COUNT["wider than the frame"])
     for seed in range(3):

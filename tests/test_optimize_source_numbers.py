@@ -8,7 +8,7 @@ import pytest
 
 import bayesfred as bf
 from bayesfred.optimize.fit_statistics import fit_statistics, misfit
-from bayesfred.optimize.source_numbers import determined_numbers
+from bayesfred.optimize.source_numbers import determined_numbers, own_radius
 
 TERMS = bf.PolynomialDistortion(f_terms=[(1, 0, 0, 0)], g_terms=[(0, 1, 0, 0)])
 FRAMES = 12
@@ -38,6 +38,36 @@ def test_a_number_that_its_prior_holds_is_not_counted(scatter: float, numbers: f
     assert determined_numbers(posterior, truth) == pytest.approx(numbers, abs=0.02)
     counted = fit_statistics(posterior, truth)["n_fitted"]
     assert counted == posterior.n_parameters + numbers
+
+
+@pytest.mark.parametrize("flux", [30.0, 300.0, 3e3])
+def test_a_number_that_both_tell_of_is_counted_in_part(flux: float) -> None:
+    """Against differences of the expected counts, where priors and counts tell about as much."""
+    scatter, h = 0.1, 1e-4
+    posterior, truth = posterior_of(
+        bf.SourceCatalog([0.3], [-0.2], [flux]), scatter, np.random.default_rng(4)
+    )
+    fitted = float(posterior.likelihood.fluxes(truth)[0])
+    # the maximum's shift is within the prior's width, whose curvature it lowers
+    *_, shifts = posterior.likelihood.own_pixels(truth, own_radius(posterior, truth))
+
+    def counts(flux: float, x: float, y: float) -> np.ndarray:
+        place = np.array([0.3 + x, -0.2 + y]) + shifts[0]
+        source = bf.SourceCatalog(place[:1], place[1:], [flux])
+        model = bf.ForwardModel(bf.Detector((64, 64)), source, bf.GaussianPSF(1.5), TERMS)
+        return model.expected_counts([0.0, 0.0], 20.0)
+
+    mean = counts(fitted, 0.0, 0.0)
+    slopes = np.stack([
+        counts(2.0 * fitted, 0.0, 0.0) - mean,  # by the relative flux
+        (counts(fitted, h, 0.0) - counts(fitted, -h, 0.0)) / (2.0 * h),
+        (counts(fitted, 0.0, h) - counts(fitted, 0.0, -h)) / (2.0 * h),
+    ]).reshape(3, -1)  # fmt: skip
+    known = (slopes / mean.ravel()) @ slopes.T
+    k = 5.0 / (3.0 * scatter**2 + float(np.sum(shifts**2)))  # Student's t, 3 degrees of freedom
+    expected = np.trace(known @ np.linalg.inv(known + np.diag([2.0, k, k])))
+    assert 0.5 < expected < 2.9
+    assert determined_numbers(posterior, truth) == pytest.approx(expected, abs=0.03)
 
 
 def test_fixed_fluxes_are_not_counted() -> None:
