@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import bayesfred as bf
+from bayesfred.optimize import measure_psf as measuring
 from bayesfred.optimize.measure_psf import psf_message
 from bayesfred.optimize.psf_samples import likely_error
 
@@ -56,6 +57,19 @@ def test_a_ghost_beside_a_source_runs_away_with_nothing(
     assert found.likelihood.fluxes(estimate.params).max() < 5.0 * FLUX  # of one that is masked
     # what is left of broad ghosts is said
     assert estimate.fits_data == (width < 3.0)
+
+
+def test_a_source_that_shows_its_wings_alone_is_masked_with_a_model_error():
+    """Else its flux grows until its error covers what is wrong there."""
+    posterior = frame_with_ghosts(1, 1.0, 2.5)  # of a photon
+    psf, state, _ = measuring.find_psf(posterior, bf.find_map(posterior), 4, 0, 0)
+    (u, v), pinholes = posterior.model.detector.pixel_centres(), posterior.model.sources
+    distance = np.hypot(u - pinholes.x[27], v[:, None] - pinholes.y[27])
+    hidden = replace(posterior, mask=posterior.mask & (distance > 6.0))
+    for model_error in (True, False):
+        found, _ = measuring._with(hidden, (psf, state), model_error, {})
+        assert found.mask[(distance > 6.0) & (distance < 7.5)].all() != model_error
+        assert found.mask[distance > 12.0].all()
 
 
 def test_a_wrong_background_is_no_error_of_the_light():
