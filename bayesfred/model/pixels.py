@@ -85,7 +85,7 @@ def usable_pixels(
         raise InputError(
             f"counts: got {n_bad} pixels that are not finite, expected numbers: mask them"
         )
-    if nuisances.model_error and noise.highest(np.where(used, counts, 1.0)) is None:
+    if nuisances.model_error and noise.at(np.s_[:1]).highest(np.ones((1, used.shape[1]))) is None:
         raise InputError(
             f"nuisances: model_error: got it with {type(noise).__name__}, expected PoissonNoise or "
             "GaussianNoise"

@@ -267,6 +267,7 @@ def _moved(posterior: Posterior, state: PsfState, change: Floats) -> PsfState:
     peak = np.abs(state.grid.combined(state.coefficients)[0]).max()
     s = posterior.model.sources
     terms = field_terms(s.x, s.y, state.grid.degree, field_radius(posterior))
+    terms = np.unique(terms, axis=0)  # one row where nothing varies
     largest = float(np.abs(terms @ wider.reshape(len(wider), -1)).max())
     change = change * min(1.0, LARGEST * peak / max(largest, 1e-300))
     params, fluxes = state.params + change[size:unknowns], state.fluxes.copy()
