@@ -68,7 +68,8 @@ def test_equations_agree_with_dense_ones():
     posterior, _ = frame_of(3, side=61, grid=4)
     state = began(posterior, bf.find_map(posterior))
     equations = NodeEquations.of(posterior, state, 0.02)
-    design, own = dense(equations), equations.eliminated.toarray()
+    design = dense(equations)
+    own = (equations.templates @ equations.eliminated).toarray()
     apart = own @ linalg.lstsq(own, np.column_stack([design, equations.residual]))[0]
     design, residual = np.hsplit(np.column_stack([design, equations.residual]) - apart, [-1])
     # the conventions by Lagrange's multipliers
@@ -97,7 +98,7 @@ def test_shifts_of_single_sources_are_pulled_to_their_prior():
     equations = NodeEquations.of(posterior, state, 0.02)
     strength, start = 7.0, np.zeros((4, equations.knots))
     found = equations.solution(strength, equations.pull, start, 1e-9).ravel()
-    own = equations.eliminated.toarray() * np.where(
+    own = (equations.templates @ equations.eliminated).toarray() * np.where(
         np.isfinite(equations.lengths), equations.lengths, 0.0
     )
     design = np.column_stack([dense(equations), own])

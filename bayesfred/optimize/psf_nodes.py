@@ -27,7 +27,7 @@ from scipy import linalg, sparse
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
-from bayesfred._typing import Flags, Floats, Ints
+from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.psf_equations import (
@@ -59,13 +59,15 @@ class NodeEquations:
         Of the model without the nodes, in standard deviations.
     splines : sparse array, shape (pixels, s knots)
         Derivatives of the pixels by the coefficients of every source.
-    parameters : ndarray, shape (pixels, d)
-        By the parameters that act on all sources.
-    eliminated : sparse array, shape (pixels, 3 s + d)
-        By the flux and the shifts of every source, and by the parameters; each column of unit
-        length, or empty where it is known.
+    templates : sparse array, shape (pixels, 3 s)
+        By the flux and the shifts of every source.
+    parameters : ndarray, shape (3 s, d)
+        How the parameters that act on all sources act on the templates.
+    eliminated : sparse array, shape (3 s, 3 s + d)
+        How what is eliminated acts on the templates: the flux and the shifts of every source, and
+        the parameters; the pixels' derivatives by it have unit length, or are 0 where it is known.
     lengths : ndarray, shape (3 s + d,)
-        That the columns had.
+        That these had.
     known : ndarray, shape (2, 3 s + d)
         Of these, the precision that they have without the counts, and times their values.
     weights : sparse array, shape (s, nodes)
@@ -80,8 +82,9 @@ class NodeEquations:
 
     residual: Floats
     splines: sparse.csr_array
+    templates: sparse.csr_array
     parameters: Floats
-    eliminated: sparse.csc_array
+    eliminated: sparse.csr_array
     lengths: Floats
     known: Floats
     weights: sparse.csr_array
@@ -105,29 +108,31 @@ class NodeEquations:
         root, source, sources = np.sqrt(pixels.weight), data.samples.source, len(state.fluxes)
         light = state.fluxes[source] * data.samples.size * root[data.owner]
         knots = np.stack([data.samples.a, data.samples.b]) * (0.5 * state.grid.oversampling)
-        shape = root.size, sources
-        splines, inside = _splines(knots, side, light, source, data.owner, shape)
-        rows = np.flatnonzero(np.bincount(data.owner[inside], minlength=root.size))
-        splines = splines[rows]
-        own = pixels.templates[:, inside] * root[data.owner[inside]]
-        columns = np.concatenate([3 * source[inside] + k for k in range(3)])
+        inside = np.abs(knots).max(axis=0) < 0.5 * (side + 3)
+        rows, owner = np.unique(data.owner[inside], return_inverse=True)
+        source, shape = source[inside], (rows.size, sources)
+        splines = _splines(knots[:, inside], side, light[inside], source, owner, shape)
+        own = pixels.templates[:, inside] * root[rows[owner]]
+        ends = np.searchsorted(owner, np.arange(rows.size + 1))
+        columns = 3 * source[:, None] + np.arange(3)
         templates = sparse.csr_array(
-            (own.ravel(), (np.tile(data.owner[inside], 3), columns)), (root.size, 3 * sources)
-        )[rows]
-        parameters = templates @ source_columns(posterior, state.params, state.fluxes)
+            (own.T.ravel(), columns.ravel(), 3 * ends), (rows.size, 3 * sources)
+        )
+        parameters = source_columns(posterior, state.params, state.fluxes)
         free = free_templates(posterior, state, pixels).ravel()
-        eliminated = sparse.hstack([templates * free, parameters]).tocsc()
-        squares = eliminated.multiply(eliminated).sum(axis=0)
+        eliminated = sparse.hstack([sparse.diags_array(1.0 * free), parameters]).tocsr()
+        gram = templates.T @ templates
+        squares = eliminated.multiply(gram @ eliminated).sum(axis=0)
         lengths = np.sqrt(np.asarray(squares, dtype=np.float64).ravel())
         lengths[lengths == 0.0] = np.inf  # what is known changes by 0
-        eliminated = (eliminated @ sparse.diags_array(1.0 / lengths)).tocsc()
+        eliminated = (eliminated @ sparse.diags_array(1.0 / lengths)).tocsr()
         values = np.column_stack([state.fluxes, state.shifts]).ravel()
         precision, known = shift_precision(posterior, state), np.zeros((2, lengths.size))
         known[:, : precision.size] = precision, precision * values
         weights = node_weights(posterior, state.nodes.number)
         residual = (pixels.score / root)[rows] + splines @ state.nodes.splines(weights).ravel()
         return cls(
-            residual, splines, parameters, eliminated, lengths, known, weights,
+            residual, splines, templates, parameters, eliminated, lengths, known, weights,
             prior.roughness.toarray() + np.diag(prior.amplitude), conventions, pixels.model_error,
         )  # fmt: skip
 
@@ -138,7 +143,7 @@ class NodeEquations:
 
     @cached_property
     def _own(self) -> SuperLU:
-        own = self.eliminated.T @ self.eliminated
+        own = self.eliminated.T @ (self.templates.T @ self.templates) @ self.eliminated
         known = self.known[0] / self.lengths**2 + TINY
         return splu((own + sparse.diags_array(known)).tocsc())
 
@@ -147,11 +152,13 @@ class NodeEquations:
 
         `tied` is the pull of what is known of them beside the counts.
         """
-        return np.asarray(self._own.solve(self.eliminated.T @ values + tied))
+        pull = self.eliminated.T @ (self.templates.T @ values)
+        return np.asarray(self._own.solve(pull + tied))
 
     def _remaining(self, values: Floats, tied: Floats | float = 0.0) -> Floats:
         """Without what is eliminated explains."""
-        return np.asarray(values - self.eliminated @ self._explained(values, tied))
+        explained = self.eliminated @ self._explained(values, tied)
+        return np.asarray(values - self.templates @ explained)
 
     def _pull(self, values: Floats) -> Floats:
         """The slope by the nodes' coefficients, given that by the pixels."""
@@ -186,7 +193,7 @@ class NodeEquations:
         knot = self.splines.indices % self.knots
         shape = len(self.residual), self.knots
         every = sparse.csr_array((self.splines.data, knot, self.splines.indptr), shape)
-        shared = (self.eliminated.T @ every).toarray()
+        shared = self.eliminated.T @ (self.templates.T @ every).toarray()
         gram = (every.T @ every).toarray() - shared.T @ self._own.solve(shared)
         over = self.weights.T @ sparse.diags_array(self._bright) @ self.weights
         seen, combinations = linalg.eigh(over.toarray())
@@ -304,7 +311,7 @@ class NodeEquations:
         -------
         ndarray, shape (d, d)
         """
-        pulls = [self._pull(image) for image in self.parameters.T]
+        pulls = [self._pull(image) for image in (self.templates @ self.parameters).T]
         none = np.zeros_like(pulls[0])
         moved = [
             self.solution(strength, pull, none, ROUGH) if pull.any() else none for pull in pulls
@@ -316,24 +323,23 @@ class NodeEquations:
 
 def _splines(
     at: Floats, side: int, light: Floats, source: Ints, owner: Ints, shape: tuple[int, int]
-) -> tuple[sparse.csr_array, Flags]:
-    """Derivatives of the pixels by the coefficients of every source, and the samples inside.
+) -> sparse.csr_array:
+    """Derivatives of the pixels by the coefficients of every source.
 
     `at` are the samples' places in the PSF in knots from its middle, shape (2, samples); `shape`
     the numbers of pixels and of sources.
     """
     pixels, sources = shape
     first = -0.5 * (side - 1) - SUPPORT - 1.0  # of the knots of B-splines that reach inside
-    inside = np.abs(at).max(axis=0) < 0.5 * (side + 3)
     parts = []
-    for places in at[:, inside]:
+    for places in at:
         design = BSpline.design_matrix(places, first + np.arange(side + 10), 3)
         parts.append((design.indices.reshape(-1, SUPPORT) - 3, design.data.reshape(-1, SUPPORT)))
     (i, wx), (j, wy) = parts
-    values = light[inside, None, None] * wy[:, :, None] * wx[:, None, :]
+    values = light[:, None, None] * wy[:, :, None] * wx[:, None, :]
     within = ((j >= 0) & (j < side))[:, :, None] & ((i >= 0) & (i < side))[:, None, :]
-    knot = (source[inside, None] * side + j)[:, :, None] * side + i[:, None, :]
-    counts = np.bincount(owner[inside], within.sum(axis=(1, 2)), pixels).astype(np.int64)
-    ends = np.concatenate([[0], np.cumsum(counts)])
-    size = pixels, sources * side**2
-    return sparse.csr_array((values[within], knot[within], ends), size), inside
+    knot = (source[:, None] * side + j)[:, :, None] * side + i[:, None, :]
+    counts = np.bincount(owner, within.sum(axis=(1, 2)), pixels)
+    ends, size = np.concatenate([[0], np.cumsum(counts)]), (pixels, sources * side**2)
+    index = sparse.get_index_dtype(maxval=max(size[1], int(ends[-1])))  # small ones are faster
+    return sparse.csr_array((values[within], knot[within].astype(index), ends.astype(index)), size)
