@@ -140,16 +140,21 @@ class ForwardModel:
 
         Pixels are integrated well for PSFs of widths down to `narrowest` (pixel).
         """
+        if narrowest is None:
+            return self._optics
+        width, beta = self.psf.core
+        offsets, weights = self.detector.quadrature(width * narrowest / self.psf.sigma, beta)
+        return self._optics._replace(offsets=offsets, weights=weights)
+
+    @cached_property
+    def _optics(self) -> Optics:
         f = np.array(self.polynomial.f_terms, dtype=np.int64).reshape(-1, 4)
         g = np.array(self.polynomial.g_terms, dtype=np.int64).reshape(-1, 4)
         # every degree is compiled on its own; the first has the second's code, as fast
         degree = max(2, int(np.concatenate([f, g])[:, 2:].max()))
         x, y = self.sources.x[:, None], self.sources.y[:, None]
         ny, nx = self.detector.shape
-        width, beta = self.psf.core
-        offsets, weights = self.detector.quadrature(
-            width if narrowest is None else width * narrowest / self.psf.sigma, beta
-        )
+        offsets, weights = self.detector.quadrature(*self.psf.core)
         return Optics(
             psf=profile_of(self.psf, self.sources.x, self.sources.y, self.detector.binning),
             x=self.sources.x,
@@ -172,10 +177,6 @@ class ForwardModel:
             ),
             translates=None if np.concatenate([f, g])[:, 2:].any() else True,
         )
-
-    @cached_property
-    def _optics(self) -> Optics:
-        return self.optics()
 
     def basis(self, nuisances: Sequence[str] = ()) -> Basis:
         """What the derivatives consist of: with respect to the monomials, then to the nuisances."""
