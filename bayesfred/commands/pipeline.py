@@ -24,7 +24,7 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import refuse_nodes
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, reject_outliers
-from bayesfred.optimize.follow import follow_images
+from bayesfred.optimize.follow import followed_images
 from bayesfred.optimize.hot_pixels import hot_pixels, pixels_named
 from bayesfred.optimize.image_widths import image_widths
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
@@ -210,13 +210,13 @@ def _by_its_peaks(
 
 def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimate, list[str]]:
     """Footprints around the images, without sources that the catalogue lacks; the maximum."""
-    followed = follow_images(posterior)
+    followed, near = followed_images(posterior)
     shared = int(np.sum(followed.mask & posterior.mask))
     lines = [
         f"footprints: {followed.mask.sum()} pixels around the images, {shared} of which are as "
         "near to the catalogue's positions"
     ]
-    estimate = approach(followed)[1] if rough else find_map(followed)
+    estimate = approach(followed, near)[1] if rough else find_map(followed)
     found = find_uncatalogued(followed, estimate)
     if lost := int(np.sum(followed.mask & ~found.mask)):
         lines.append(f"{found.message}; {lost} pixels masked")

@@ -58,19 +58,40 @@ def follow_images(posterior: Posterior, estimate: MapEstimate | None = None) -> 
     >>> int(u.min()), int(u.max())
     (12, 21)
     """
-    radius = posterior.nuisances.footprint
-    if radius is None:
+    if posterior.nuisances.footprint is None:
         return posterior
-    params = estimate.params if estimate is not None else _start(posterior)
-    seen: set[bytes] = set()
+    return followed_images(posterior, None if estimate is None else estimate.params)[0]
+
+
+def followed_images(
+    posterior: Posterior, start: Floats | None = None
+) -> tuple[Posterior, Floats | None]:
+    """The posterior as of `follow_images`, and about where its maximum is, if it has density there.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With a `footprint`.
+    start : ndarray, shape (d,), optional
+
+    Returns
+    -------
+    posterior : Posterior
+    params : ndarray, shape (d,), or None
+    """
+    radius, seen = posterior.nuisances.footprint, set[bytes]()
+    assert radius is not None, "there are footprints"
+    params = _start(posterior) if start is None else start
     for _ in range(ROUNDS):
         followed = _around(posterior, params, radius)
         key = followed.mask.tobytes()
-        if key in seen or not np.isfinite(followed.log_prob(params)):
+        if key in seen:
             break
+        if not np.isfinite(followed.log_prob(params)):
+            return followed, None
         seen.add(key)
         params = maximize(followed, params, steps=STEPS).params
-    return followed
+    return followed, params
 
 
 def _start(posterior: Posterior) -> Floats:
