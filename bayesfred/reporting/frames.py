@@ -63,12 +63,10 @@ class FittedFrame:
     @classmethod
     def at(cls, posterior: Posterior, params: Floats) -> "FittedFrame":
         """The frame of a posterior with the model of one parameter vector, shape (d,)."""
-        return cls(
-            posterior.counts,
-            posterior.expected_counts(params),
-            posterior.sigma(params),
-            posterior.mask,
-        )
+        expected = posterior.expected_counts(params)
+        level = params[posterior.parameter_names.index("background")]
+        variance = posterior.noise_at(params).counts_variance(expected, level)
+        return cls(posterior.counts, expected, np.sqrt(variance), posterior.mask)
 
     def recorded(self) -> Floats:
         """The frame, nan where a pixel was masked because it holds no counts."""
