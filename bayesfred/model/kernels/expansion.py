@@ -39,7 +39,7 @@ import numpy as np
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import inner, leaf, shared
 from bayesfred.imaging.kernels.fastmath import REDUCE
-from bayesfred.model.kernels.clusters import run_end, touch
+from bayesfred.model.kernels.clusters import copy, run_end, touch
 
 OVERLAP = 1e-4  # the least |H_st| / sqrt(H_ss H_tt) that counts
 POWERS = ((1, 1), (2, 1), (1, 2), (3, 1), (2, 2), (1, 3))  # of the mixed sums N
@@ -210,7 +210,7 @@ def expand(touching, group, fluxes, shape, pixels):
         _fill_own(touching, s, fluxes[s], pixels, own[i])
         alone[i, 0] = single(own[i], shape, alone[i, 1:])
         value += alone[i, 0]
-        slopes[i] = alone[i, 1:]
+        copy(alone[i, 1:], slopes[i])
         for k in range(group.lead[i * size] // size, i):
             t = members[k]
             if _both(touching, s, t):
@@ -218,9 +218,11 @@ def expand(touching, group, fluxes, shape, pixels):
                 if related(own[i, 0], own[k, 0], mixed[count, 0], shape):
                     value += pair(own[i], own[k], mixed[count], shape, by)
                     value -= alone[i, 0] + alone[k, 0]
-                    slopes[i] += by[:3] - alone[i, 1:]
-                    slopes[k] += by[3:6] - alone[k, 1:]
-                    first[count], second[count], mixed[count] = i, k, by[6:]
+                    for n in range(3):
+                        slopes[i, n] += by[n] - alone[i, 1 + n]
+                        slopes[k, n] += by[3 + n] - alone[k, 1 + n]
+                    copy(by[6:], mixed[count])
+                    first[count], second[count] = i, k
                     count += 1
     return value, Slopes(slopes, first[:count], second[:count], mixed[:count])
 

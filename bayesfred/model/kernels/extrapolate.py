@@ -235,6 +235,14 @@ def _next_term(visit, shape):
     return value
 
 
+@leaf()
+def _are_positive(fluxes):
+    positive = 0
+    for flux in fluxes:
+        positive += flux > 0.0
+    return positive == fluxes.size
+
+
 @inner()
 def profile_extrapolated(problem, w, parameters, fluxes, known):
     """The log-likelihood; NaN where the fluxes are too far from the maximum.
@@ -245,7 +253,7 @@ def profile_extrapolated(problem, w, parameters, fluxes, known):
     geometry = new_geometry(o)
     if not locate(o, parameters.theta, nuisances, geometry):
         return -math.inf
-    if not np.min(fluxes) > 0.0:
+    if not _are_positive(fluxes):
         return math.nan
     layout = lay_out(o, geometry, nuisances.psf_sigma)
     fp, clusters = layout.footprints, known.clusters
@@ -272,6 +280,6 @@ def profile_extrapolated(problem, w, parameters, fluxes, known):
         if change < ENOUGH:
             value += _next_term(visit, problem.shape)
             return value + log_likelihood(frame, w, parameters)
-        if not (change < 0.5 * fluxes.size and np.min(fluxes) > 0.0):
+        if not (change < 0.5 * fluxes.size and _are_positive(fluxes)):
             break
     return math.nan

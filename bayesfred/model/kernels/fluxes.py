@@ -117,14 +117,15 @@ def _take_step(cluster, step, shares, together):
     Returns the largest relative change of the whole step.
     """
     fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
-    fluxes, size, most = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0
+    fluxes, size, most, least = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0, math.inf
     for i in range(members.size):
         largest = _relative(cluster, step, i)
         most = max(most, largest)
         if shares[i] * largest >= 0.5:
             shares[i] = min(shares[i], 1.0 / (1.0 + largest))
+        least = min(least, shares[i])
     if together:
-        shares[:] = shares.min()
+        shares[:] = least
     for i in range(members.size):
         s, own = members[i], shares[i] * step[i * size : (i + 1) * size]
         if size > 1:
