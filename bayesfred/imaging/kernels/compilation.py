@@ -291,8 +291,9 @@ def shared(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _compiled(function: Callable[..., Any], is_shared: bool = False, **options: Any) -> Any:
-    # a function without the option would take it from the first that calls it
-    dispatcher = nb.njit(**{"_nrt": True, "pipeline_class": _Compiler} | options)(function)
+    # a function without the options would take them from the first that calls it
+    ours = {"_nrt": True, "error_model": "numpy", "pipeline_class": _Compiler}
+    dispatcher = nb.njit(**ours | options)(function)
     if is_shared:
         dispatcher._cache = _Cache(function)
     return dispatcher

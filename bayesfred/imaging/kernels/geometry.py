@@ -283,7 +283,7 @@ def move(o, geometry, s, by_x, by_y):
     multiply(a, b, len(o.degrees.d) > 0, geometry.q[s], geometry.d[s])
 
 
-@shared(fastmath=FAST, error_model="numpy")
+@shared(fastmath=FAST)
 def find_footprints(o, geometry):
     """The rows of pixels that every source reaches, their lengths multiples of LANES."""
     sources, size = geometry.peak.shape[0], 0

@@ -123,7 +123,7 @@ def widens(basis):
     return size > 0 and basis.row[-1] == basis.f.shape[0] + basis.g.shape[0] + 1
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _polynomial_row(out, line, coefficients, degree):
     """out[i] = a polynomial of t."""
     top, ramp, t0 = len(degree), line.ramp, line.t0
@@ -135,7 +135,7 @@ def _polynomial_row(out, line, coefficients, degree):
         out[i] = p
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _times_polynomial(out, source, factor, line, coefficients, degree):
     """out[i] = factor times source[i] times a polynomial of t."""
     top, ramp, t0 = len(degree), line.ramp, line.t0
@@ -147,7 +147,7 @@ def _times_polynomial(out, source, factor, line, coefficients, degree):
         out[i] = p * factor * source[i]
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _slopes_row(psf, inverse, weight, p, a, b):
     """From a and b to weight times p, p_a and p_b."""
     slope = -weight * inverse
@@ -156,7 +156,7 @@ def _slopes_row(psf, inverse, weight, p, a, b):
         p[i], a[i], b[i] = weight * k, slope * x, slope * y
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _second_derivatives_row(psf, inverse, weight, along_a, samples):
     """The same for -p_a, or for -p_b, in place of p."""
     p, a, b = samples.p, samples.along_a, samples.along_b
@@ -167,7 +167,7 @@ def _second_derivatives_row(psf, inverse, weight, along_a, samples):
         a[i], b[i] = second * (xx if along_a else xy), second * (xy if along_a else yy)
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _times_determinant(p, size, signed):
     """From D in `signed` to size = p |D| and p sign(D)."""
     for i in range(p.size):
@@ -175,14 +175,14 @@ def _times_determinant(p, size, signed):
         signed[i] = p[i] if signed[i] > 0.0 else -p[i]
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _times_absolute(a, b, d):
     for i in range(d.size):
         a[i] *= abs(d[i])
         b[i] *= abs(d[i])
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def samples_row(sampler, weight, template, line, samples):
     """Sample P = weight p and what comes with it on the row that `sampler.work` describes.
 
@@ -204,7 +204,7 @@ def samples_row(sampler, weight, template, line, samples):
     _times_determinant(samples.p, samples.size, samples.signed)
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _add_widening(out, order, samples, sampler, line):
     """Add dP/dsigma = -(order P + a P_a + b P_b) / sigma.
 
@@ -223,13 +223,13 @@ def _add_widening(out, order, samples, sampler, line):
         out[i] -= (order * size[i] + a * along_a[i] + b * along_b[i]) * inverse
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _add_row_of(out, row):
     for i in range(row.size):
         out[i] += row[i]
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _powers_row(powers, ramp, u0, n):
     """powers[m] = u^m at u = u0 + ramp[i]."""
     powers[0, :n] = 1.0
@@ -239,7 +239,7 @@ def _powers_row(powers, ramp, u0, n):
             row[i] = before[i] * (u0 + ramp[i])
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _add_monomials(basis_powers, v, terms, powers, out, start):
     """Add B along + B_u first + B_v second to the rows of the basis from `start` on.
 
@@ -261,7 +261,7 @@ def _add_monomials(basis_powers, v, terms, powers, out, start):
                 row[i] += bx * lower[i] * first[i]
 
 
-@shared(_nrt=False, fastmath=FAST, error_model="numpy")
+@shared(_nrt=False, fastmath=FAST)
 def basis_row(rows, source, u_row, v_row, n, template):
     """Fill rows.out with the basis of a unit source in n pixels from (u_row, v_row) on.
 

@@ -37,7 +37,7 @@ class Lines(NamedTuple):
     top: int  # and row
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _fill_line(o, t0, inverse, factor, out):
     """Fill a line of pixels whose middles are at a = t0 + ramp."""
     out[:] = 0.0

@@ -35,7 +35,7 @@ from bayesfred.imaging.kernels.psf_dispatch import (
 BATCH = 32
 
 
-@shared(_nrt=False, fastmath=FAST, error_model="numpy")
+@shared(_nrt=False, fastmath=FAST)
 def _add_samples(layout, s, rows, flux, canvas, alone):
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this
     # function: a call costs more than a short row. It counts no references: threads count those to
@@ -86,7 +86,7 @@ def _add_by_product(layout, s, rows, flux, canvas, alone):
 add_source = by_image(_add_by_product, _add_by_samples)
 
 
-@shared(fastmath=FAST, error_model="numpy")
+@shared(fastmath=FAST)
 def add_templates(layout, s, flux, stamps, wider):
     """Add K, F X and F Y of source s to its rows of `stamps`, shape (3, samples).
 

@@ -132,7 +132,7 @@ def _add_moments(sums, moments, w):
         factor *= w
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _sample_sums(layout, source, rows, template, weight, buffers):
     """Fill the sums of A, B and E over these rows of the footprints; returns that of P |D|."""
     # what the rows share is taken out of the tuples once, see `Sampler`

@@ -140,7 +140,7 @@ def run_end(fp, i, last, at):
     return i
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE)
 def dot(a, b, weight):
     """The sum of weight a b."""
     total = 0.0

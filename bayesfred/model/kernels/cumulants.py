@@ -58,7 +58,7 @@ def table_value(table, cell, w):
     return g
 
 
-@entry(fastmath=FAST, error_model="numpy")
+@entry(fastmath=FAST)
 def _densities(kind, n, mu, variance, out):
     for i in range(out.size):
         out[i] = density_of(kind, n[i], mu[i], variance)

@@ -124,7 +124,7 @@ def start(cluster, level):
         _add_step(cluster, (fp.first[s], fp.first[s + 1]), fluxes[s])
 
 
-@inner(error_model="numpy")
+@inner()
 def _correct(cluster, lower, slopes, step):
     """Add Chebyshev's correction to a Newton step."""
     group, fluxes = cluster.group, cluster.fluxes
@@ -139,7 +139,7 @@ def _correct(cluster, lower, slopes, step):
         step[i] += more[i]
 
 
-@leaf(error_model="numpy")
+@leaf()
 def _scale(cluster, lower, slopes, step):
     """Make Cholesky's factor of H that of D H D, before the step is taken."""
     group = cluster.group
@@ -247,7 +247,7 @@ def _look(cluster, near, sums, h):
                 near[place] = h[place] ** 2 > FAR**2 * sums[i, 1] * sums[k, 1]
 
 
-@inner(error_model="numpy")
+@inner()
 def _visit(frame, parameters, cluster, step, kind, pairs):
     """Take a step in the image, and return the sums of `_moments` over every source's pixels.
 
@@ -283,7 +283,7 @@ def _visit(frame, parameters, cluster, step, kind, pairs):
     return sums
 
 
-@leaf(error_model="numpy")
+@leaf()
 def _newton_step(cluster, sums, slopes, fresh, h, step):
     """Fill a Newton step; if `fresh`, H's diagonal from the sums, then its factor, and beta."""
     group, fluxes, prior = cluster.group, cluster.fluxes, cluster.prior
@@ -301,7 +301,7 @@ def _newton_step(cluster, sums, slopes, fresh, h, step):
     return True
 
 
-@leaf(error_model="numpy")
+@leaf()
 def _largest(cluster, step):
     """The largest relative change that a step makes."""
     largest = 0.0
@@ -310,7 +310,7 @@ def _largest(cluster, step):
     return largest
 
 
-@inner(error_model="numpy")
+@inner()
 def maximize_fluxes(frame, parameters, cluster, h):
     """Find a cluster's fluxes; leaves Cholesky's factor of H in h. False if it fails."""
     members = cluster.group.members

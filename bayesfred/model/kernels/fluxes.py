@@ -71,7 +71,7 @@ TRIES = 4  # other modes that are looked at in a cluster
 TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
 
 
-@inner(error_model="numpy")
+@inner()
 def _fill_gradient(cluster, out):
     """The gradient of log L + log p in a cluster's fluxes and shifts."""
     fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
@@ -86,7 +86,7 @@ def _fill_gradient(cluster, out):
             out[i] -= weight * cluster.shifts[s, t - 1]
 
 
-@inner(error_model="numpy")
+@inner()
 def _relative(cluster, step, i):
     """The largest relative change that a step makes in the flux and shift of source i."""
     size, flux = cluster.touching.stamps.shape[0], cluster.fluxes[cluster.group.members[i]]
@@ -110,7 +110,7 @@ def _change(cluster, s, flux, dx, dy):
     add_template(fp, rows, stamps[0], fluxes[s], cluster.canvas)
 
 
-@inner(error_model="numpy")
+@inner()
 def _take_step(cluster, step, shares, together):
     """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`.
 
@@ -136,7 +136,7 @@ def _take_step(cluster, step, shares, together):
     return most
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE)
 def _subtract_second_derivatives(cluster, i, out):
     """Subtract from a source's block of H the second derivatives times the score.
 
@@ -164,7 +164,7 @@ def _subtract_second_derivatives(cluster, i, out):
     add_block(i, cluster.group.start, out, (fx / flux, fy / flux, xx, xy, yy))
 
 
-@inner(error_model="numpy")
+@inner()
 def _factor(cluster, h, lower):
     """Cholesky's factor of H, less the second derivatives where that is possible, in `lower`."""
     if cluster.touching.stamps.shape[0] > 1:
@@ -177,7 +177,7 @@ def _factor(cluster, h, lower):
     return cholesky(lower, cluster.group)
 
 
-@inner(error_model="numpy")
+@inner()
 def _secant(gradient, step, distances, shares, most):
     """The shares of the next step, given the last one and the gradient where it led.
 
@@ -192,7 +192,7 @@ def _secant(gradient, step, distances, shares, most):
             shares[i] = min(most, shares[i] / max(1.0 - left, 0.1))
 
 
-@inner(error_model="numpy")
+@inner()
 def _maximize(frame, parameters, cluster, h):
     """Newton's iteration for a cluster; leaves Cholesky's factor of H in h. False if it fails."""
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
@@ -235,7 +235,7 @@ def _maximize(frame, parameters, cluster, h):
     return False
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE)
 def _known(cluster, s):
     """What the pixels tell of a source's shift along itself, its flux unknown."""
     fp, stamps, at = cluster.layout.footprints, cluster.touching.stamps, cluster.canvas.at
@@ -252,7 +252,7 @@ def _known(cluster, s):
     return (along - cross * cross / own) / (dx * dx + dy * dy)
 
 
-@inner(error_model="numpy")
+@inner()
 def _log_density(frame, parameters, cluster, h):
     """What the log-density of a cluster's mode and its width say, up to constants."""
     patch, noise, value = cluster.patch, given(frame.noise, parameters), 0.0
@@ -266,7 +266,7 @@ def _log_density(frame, parameters, cluster, h):
     return value + _log_prior(cluster, h)
 
 
-@inner(error_model="numpy")
+@inner()
 def _log_prior(cluster, h):
     """Of a cluster's fluxes and shifts, less half the logarithm of H's determinant."""
     prior, start, value = cluster.prior, cluster.group.start, 0.0
@@ -283,7 +283,7 @@ def _log_prior(cluster, h):
     return value
 
 
-@inner(error_model="numpy")
+@inner()
 def _climb(frame, parameters, cluster, h):
     """The same for the highest mode: a shift may have two, see `shift_modes.py`."""
     found = _maximize(frame, parameters, cluster, h)
@@ -318,7 +318,7 @@ def _climb(frame, parameters, cluster, h):
     return True
 
 
-@shared(error_model="numpy")
+@shared()
 def profile(problem, layout, w, parameters, profiled, fluxes):
     """Fill the fluxes and `profiled` with their maximum; add the sources to the image.
 

@@ -166,7 +166,7 @@ def stretch(frame, background, j, first, image):
     return Stretch(frame.values[first : first + image.size], image, first, c0, c1, c2, u, step)
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def weigh_run(noise, part, score, weight, ratio):
     """Score d log L/d mu and weight -d^2 log L/d mu^2 of a stretch, zero where masked.
 

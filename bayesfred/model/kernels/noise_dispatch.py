@@ -101,7 +101,7 @@ def _choose_part(mean: Any, first: Any, size: Any) -> Any:
     )
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE)
 def sum_pixels(noise, values, light, mean, first):
     """Sum of the log-densities of the unmasked pixels of a stretch, one by one."""
     (image, level, response), total = mean, 0.0

@@ -24,14 +24,14 @@ from bayesfred.model.kernels.clusters import DOF, SHARE
 FARTHEST = 2.0  # widths of the PSF within which the counts' slope says where the other mode is
 
 
-@inner(error_model="numpy")
+@inner()
 def _height(x, m, known, c):
     """Minus the log-density of a mode, and half the logarithm of its determinant."""
     held = SHARE * (DOF + 2.0) / (known * (c + x * x))
     return 0.5 * known * (x - m) ** 2 + (0.5 * DOF + 1.0) * math.log1p(x * x / c) + math.log1p(held)
 
 
-@inner(error_model="numpy")
+@inner()
 def other_mode(shift, known, scatter, sigma):
     """By how much the other mode is higher, and where it is in units of this one.
 
