@@ -185,11 +185,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
 
 class _Part(JITCodeLibrary):  # type: ignore[misc]
-    """A library that is only linked into others, and so is never turned into machine code.
-
-    Its callers are optimised as a whole with it in them. To optimise it before would take a sixth
-    of all time, and leaves loops that are slower.
-    """
+    """A library that is only linked into others, and so is never turned into machine code."""
 
     @property
     def codegen(self) -> "_Part":
@@ -199,11 +195,9 @@ class _Part(JITCodeLibrary):  # type: ignore[misc]
         """Set nothing: the callers' machine code has it, see `_Cache`."""
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return null, the pointer of a wrapper that is missing."""
+        """Optimise the library; the pointer is null, as that of a wrapper that is missing."""
+        self._ensure_finalized()
         return 0
-
-    def _optimize_final_module(self) -> None:
-        """Leave it to the callers."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
