@@ -38,6 +38,22 @@ def as_bits(typingctx: Any, value: Any) -> Any:
 
 
 @intrinsic
+def split_single(typingctx: Any, x: Any) -> Any:
+    """`split` of a positive normal float32: two numbers of that type."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        integer, single = ir.IntType(32), ir.FloatType()
+        least = ir.Constant(integer, 1060439283)  # the bits of sqrt(1/2)
+        bits = builder.sub(builder.bitcast(args[0], integer), least)
+        k = builder.sitofp(builder.ashr(bits, ir.Constant(integer, 23)), single)
+        m = builder.add(builder.and_(bits, ir.Constant(integer, 8388607)), least)
+        parts = [k, builder.bitcast(m, single)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return nb.types.UniTuple(nb.types.float32, 2)(nb.types.float32), codegen
+
+
+@intrinsic
 def take_turn(typingctx: Any, turn: Any) -> Any:
     """The int64 that an array begins with, raised by one: no two threads get the same."""
 
@@ -90,13 +106,10 @@ def log(x):
     k, m = split(x)
     s = (m - 1.0) / (m + 1.0)
     z = s * s
-    p = 7.3089406919315180756e-02
-    p = p * z + 7.6657981172986236734e-02
-    p = p * z + 9.0914466202426646721e-02
-    p = p * z + 1.1111105536283593608e-01
-    p = p * z + 1.4285714313200197706e-01
-    p = p * z + 1.9999999999949222791e-01
-    p = p * z + 3.3333333333333348644e-01
+    w = z * z
+    p = 9.0914466202426646721e-02 + z * 7.6657981172986236734e-02 + w * 7.3089406919315180756e-02
+    q = 1.4285714313200197706e-01 + z * 1.1111105536283593608e-01
+    p = 3.3333333333333348644e-01 + z * 1.9999999999949222791e-01 + w * (q + w * p)
     return k * 6.93147180369123816490e-01 + (
         2.0 * s + (2.0 * s * z * p + k * 1.90821492927058770002e-10)
     )

@@ -10,10 +10,10 @@ is (G1 - G2) / mu^2, and C = -1/2 dW / d mu is (G3 - 3 G2 + 2 G1) / 2 mu^3. As a
 zeros of exp(g) are real and negative, so log p is concave in mu.
 
 Read noise below 1: the sum itself. Of the k around n, `REACH` on either side are taken. The ratio
-of successive terms is exp((n - k - 1/2) / r^2) mu / (k + 1), so the sum is a polynomial in mu,
-written with a common denominator that depends on n alone. Within 6 standard deviations of the mean
-the error of log p is below 1e-9, and within 15 below 1: there n is so far above a small mean that
-the likely k are out of reach.
+of successive terms is exp((n - k - 1/2) / r^2) mu / (k + 1). So in units of the term at n the sum
+is a polynomial in mu, with a common denominator that depends on n alone, and one in 1 / mu. Within
+6 standard deviations of the mean the error of log p is below 1e-9, and within 15 below 1: there n
+is so far above a small mean that the likely k are out of reach.
 
 Read noise from 1 on: tilting by exp(s n) turns the distribution into one of the same kind with mean
 y = mu exp(s). If s is chosen so that the tilted mean of n is n itself,
@@ -27,8 +27,8 @@ without approximation, where phi(y) is the density of Poisson(y) + N(0, r^2) at 
 
 and `CORRECTION` is a polynomial that goes on to q^3. It was fitted to the sum, from which it
 differs by less than 1e-5 for any y. The mean is y = r^2 omega(log(mu / r^2) + n / r^2), where omega
-+ log omega = x. A rough omega gives s to 2e-3, and a step of Newton's method with its
-second-order term makes that 1e-8.
++ log omega = x. A rough omega gives s to 2e-3, for which the digits of float32 suffice, and a step
+of Newton's method with its second-order term makes that 1e-8.
 
 References
 ----------
@@ -48,30 +48,35 @@ from scipy.special import gammaln
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import inner
-from bayesfred.imaging.kernels.fastmath import FAST, LOG2_E, exp2, log, split
+from bayesfred.imaging.kernels.fastmath import FAST, LOG2_E, exp2, log, split_single
 
 REACH = 8  # terms of the sum on either side of n, see `photon_sum`
 WIDE = 1.0  # variance of the read noise from which on the saddlepoint expansion serves
-LEAST = 1e-30  # stands for smaller expected counts in the sum, whose powers must not underflow
+LEAST = 1e-30  # stands for smaller expected counts, whose powers must not underflow
+STEEPEST = 1e30  # of the ratios of successive terms
+MOST = 1e75  # of the sum in units of its term at n: four of them are multiplied
 NEGLIGIBLE = 1e-25  # of successive terms, whose products shall not become denormal numbers
 FARTHEST = 35.0  # exponents of a step's factors: smaller ones than exp(-35) change no sum
-TINY = 1e-200  # ... and in the saddlepoint expansion
+SINGLE = np.float32  # serves what is rough anyway
+LEAST_SINGLE = SINGLE(1e-37)  # of float32 numbers that are normal
 
-# log phi + 1/2 log(2 pi v): coefficients of q^i rho^j, a row for i = 1, 2, 3, from j = 1 on
+# log phi + 1/2 log(2 pi v): coefficients of (1 + t) q^i t^j, t = 2 rho - 1, a row for i = 1, 2, 3
 CORRECTION = (
-    (1 / 8, -5 / 24),
-    (-0.01966183926947379, 0.22304878295513086, -0.5170116244823475, 0.3179110858392214),
-    (0.0011830114308505552, -0.08585417212460593, 0.6067678293230436, -2.779207981131074,
-     16.007686898374327, -56.830514686197134, 100.23868418598953, -84.27288563281161,
-     27.13986351939822),
+    (1 / 96, -5 / 96),
+    (0.0011742659087037206, -0.013882381786950147, -0.005018124465439425, 0.019869442864951337),
+    (0.00046817276752711455, -0.011384207538163282, -0.00566020437365114, 0.05652583764187838,
+     -0.004078308307542466, -0.13387604788596819, -0.03701071010205914, 0.09486940798742682,
+     0.053007545936324646),
 )  # fmt: skip
+SINGLE_CORRECTION = tuple(tuple(map(SINGLE, row)) for row in CORRECTION)
 
 
 def _correction_table() -> Floats:
     """The coefficients of q^i tau^j, tau = 1 - rho, times (i + j)^n: shape (n, i, j)."""
     out = np.zeros((4, 3, 10))
     for i, row in enumerate(CORRECTION):
-        in_tau = np.polynomial.Polynomial([0.0, *row])(np.polynomial.Polynomial([1.0, -1.0])).coef
+        rho = np.polynomial.Polynomial([1.0, -1.0])
+        in_tau = (np.polynomial.Polynomial(row)(2.0 * rho - 1.0) * (2.0 * rho)).coef
         for n in range(4):
             power = np.arange(in_tau.size, dtype=np.float64) + (i + 1)
             out[n, i, : in_tau.size] = np.asarray(in_tau, dtype=float) * power**n
@@ -143,38 +148,37 @@ def _sum_above(k, a, q):
 
 
 @inner(fastmath=FAST, forceinline=True)
-def _sum_below(k, mu, a, q):
-    """mu^8 a k / mu (1 + a q (k - 1) / mu (1 + ...)), and mu^8."""
-    q2, a2, mu2 = q * q, a * q, mu * mu
-    q4, a3, a4, mu4 = q2 * q2, a * q2, a2 * q2, mu2 * mu2
-    series = a4 * q4 * (k - 7.0)
-    series = (mu + series) * (a3 * q4 * (k - 6.0))
-    series = (mu2 + series) * (a2 * q4 * (k - 5.0))
-    series = (mu2 * mu + series) * (a * q4 * (k - 4.0))
-    series = (mu4 + series) * (a4 * (k - 3.0))
-    series = (mu4 * mu + series) * (a3 * (k - 2.0))
-    series = (mu4 * mu2 + series) * (a2 * (k - 1.0))
-    return (mu4 * mu2 * mu + series) * (a * k), mu4 * mu4
+def _sum_below(k, b, q):
+    """b k (1 + b q (k - 1) (1 + ...))."""
+    q2, b2 = q * q, b * q
+    q4, b3, b4 = q2 * q2, b * q2, b2 * q2
+    series = 1.0 + b4 * q4 * (k - 7.0)
+    series = 1.0 + series * (b3 * q4 * (k - 6.0))
+    series = 1.0 + series * (b2 * q4 * (k - 5.0))
+    series = 1.0 + series * (b * q4 * (k - 4.0))
+    series = 1.0 + series * (b4 * (k - 3.0))
+    series = 1.0 + series * (b3 * (k - 2.0))
+    series = 1.0 + series * (b2 * (k - 1.0))
+    return series * (b * k)
 
 
 @inner(fastmath=FAST, forceinline=True)
 def photon_sum(k, mu, up, down):
-    """The sum as a polynomial in mu: times mu^(k - 8) exp(-mu) it is p up to a factor of n."""
+    """The sum, in units of its term at k photons."""
     q = up * down
     above, common = _sum_above(k, up * mu, q)
-    below, power = _sum_below(k, mu, down, q)
-    return power * above + common * below
+    return min(_sum_below(k, min(down / mu, STEEPEST), q) + above / common, MOST)
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def _sum_density(n, mu, variance):
     """log p of the sum, less what depends on n alone."""
     k, mu = nearest(n), max(mu, LEAST)
     up, down = steps(n, 1.0 / variance)
-    return (k - REACH) * log(mu) - mu + log(photon_sum(k, mu, up, down))
+    return k * log(mu) - mu + log(photon_sum(k, mu, up, down))
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def _derivatives(mu, first, second, third):
     """Score, weight and C from the cumulants of the photon number given n."""
     inverse = 1.0 / mu
@@ -183,7 +187,7 @@ def _derivatives(mu, first, second, third):
     return first * inverse - 1.0, weight, curve
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def _sum_derivatives(n, mu, variance):
     """Score, weight and C of the sum."""
     k, mu = nearest(n), max(mu, LEAST)
@@ -219,32 +223,32 @@ def _sum_derivatives(n, mu, variance):
 
 
 @inner(fastmath=FAST, forceinline=True)
-def _rough_log(x):
-    """log(x) of a positive normal number to 1e-4, without a division; see `fastmath.log`."""
-    k, m = split(x)
-    m -= 1.0
-    p = m * (0.99935223 + m * (-0.50246549 + m * (0.35871218 - m * 0.22848254)))
-    return k * math.log(2.0) + p
+def rough_log(x):
+    """log(x) of a positive normal float32 to 1e-4, without a division; see `fastmath.log`."""
+    k, m = split_single(x)
+    m -= SINGLE(1.0)
+    p = SINGLE(-0.50246549) + m * (SINGLE(0.35871218) - m * SINGLE(0.22848254))
+    return k * SINGLE(math.log(2.0)) + m * (SINGLE(0.99935223) + m * p)
 
 
 @inner(fastmath=FAST, forceinline=True)
-def rough_x(n, mu, inverse):
-    """log(mu / r^2) + n / r^2, where `inverse` is 1 / r^2."""
-    return n * inverse + _rough_log(mu * inverse)
-
-
-@inner(fastmath=FAST, forceinline=True)
-def rougher_omega(x):
+def rough_omega(x):
     """omega(x) within 7 % where it is above 0.05: a square and a line."""
-    u = min(max(x, -6.0), 3.0)
-    root = 0.75107911 + u * (0.21642757 + u * 0.01549135)
-    return max(root * root, 0.93841083 * x - 0.89488641)
+    u = min(max(x, SINGLE(-6.0)), SINGLE(3.0))
+    root = SINGLE(0.75107911) + u * (SINGLE(0.21642757) + u * SINGLE(0.01549135))
+    return max(root * root, SINGLE(0.93841083) * x - SINGLE(0.89488641))
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
-def rough_omega(x, w):
-    """omega(x) to 2e-3: a step of Newton's method from w."""
-    return max(w * (1.0 + x - _rough_log(w)) / (1.0 + w), 0.0)
+@inner(fastmath=FAST, forceinline=True)
+def rough_tilt(slope, level, x, w):
+    """The tilt to 2e-3: a step of Newton's method from the rough omega w.
+
+    `slope` is n / r^2, `level` log(w r^2 / mu) and `x` what x - log(w) - w is. Where omega is large
+    its logarithm tells s, and not n / r^2 - omega, whose digits cancel.
+    """
+    change = x / (SINGLE(1.0) + w)  # of log(omega), to first order
+    large = level + change * (SINGLE(1.0) - change * (SINGLE(0.5) - change * SINGLE(1 / 3)))
+    return large if w > SINGLE(0.1) else slope - max(w + w * change, SINGLE(0.0))
 
 
 @inner(fastmath=FAST, forceinline=True)
@@ -253,9 +257,9 @@ def tilted_mean(mu, s):
     return mu * _exp(s)
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def improved(n, mu, variance, s, y):
-    """log p without log phi from rough s and y, and s, y and v = y + r^2 to 1e-11.
+    """log p without log phi from rough s and y, s, y and v = y + r^2 to 1e-11, and 1 / v to 1e-5.
 
     log p is stationary in s, so that the change of s counts by its square.
     """
@@ -267,49 +271,53 @@ def improved(n, mu, variance, s, y):
     term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + third)
     change *= 1.0 + change * rho * (0.5 + change * (0.5 * rho - 1.0 / 6.0))
     less -= variance * change  # y + r^2 s = n
-    return term, s - change, y - less, total - less
+    v = total - less
+    return term, s - change, y - less, v, q * (2.0 - q * v)
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
-def correction(v, variance):
-    """log phi + 1/2 log(2 pi v)."""
-    q = 1.0 / v
-    rho = 1.0 - variance * q
-    one, two, three = CORRECTION
+@inner(fastmath=FAST, forceinline=True)
+def correction(coefficients, q, t):
+    """log phi + 1/2 log(2 pi v), in the type of all numbers; t = 2 rho - 1."""
+    one, two, three = coefficients
     total = three[8]
     for j in range(7, -1, -1):
-        total = total * rho + three[j]
+        total = total * t + three[j]
     by = two[3]
     for j in range(2, -1, -1):
-        by = by * rho + two[j]
-    return rho * q * (one[0] + rho * one[1] + q * (by + q * total))
+        by = by * t + two[j]
+    first = one[0] + t * one[1]
+    return (q + t * q) * (first + q * (by + q * total))
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def _tilt(n, mu, variance):
-    """log p without log phi, and s, y and v to 1e-11."""
-    inverse = 1.0 / variance
-    x = rough_x(n, mu, inverse)
-    s = n * inverse - rough_omega(x, rougher_omega(x))
+    """As `improved`, from the rough tilt."""
+    inverse = SINGLE(1.0 / variance)
+    slope = SINGLE(n) * inverse
+    level = rough_log(max(SINGLE(mu) * inverse, LEAST_SINGLE))
+    w = rough_omega(slope + level)
+    log_w = rough_log(w)
+    s = float(rough_tilt(slope, log_w - level, slope + level - log_w - w, w))
     return improved(n, mu, variance, s, tilted_mean(mu, s))
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def _tilted_density(n, mu, variance):
     """log p of the saddlepoint expansion, less -1/2 log(2 pi)."""
-    term, _, _, v = _tilt(n, max(mu, TINY), variance)
-    return term - 0.5 * log(v) + correction(v, variance)
+    term, _, _, v, _ = _tilt(n, max(mu, LEAST), variance)
+    q = 1.0 / v
+    return term - 0.5 * log(v) + correction(CORRECTION, q, 1.0 - 2.0 * variance * q)
 
 
-@inner(fastmath=FAST, forceinline=True, error_model="numpy")
+@inner(fastmath=FAST, forceinline=True)
 def _tilted_derivatives(n, mu, variance):
     """Score, weight and C of the saddlepoint expansion.
 
     The cumulants of the photon number given n are derivatives by log mu. With L that derivative
     and M = q d/dq, L y = y tau and L = -rho tau M for functions of q.
     """
-    mu = max(mu, TINY)
-    _, s, y, v = _tilt(n, mu, variance)
+    mu = max(mu, LEAST)
+    _, s, y, v, _ = _tilt(n, mu, variance)
     y = mu * _exp(s - (y + variance * s - n) / v)  # to rounding
     q = 1.0 / (y + variance)
     tau, rho = variance * q, y * q
@@ -388,5 +396,5 @@ def kind_of(variance: float | Floats) -> tuple[int, ...]:
 def left_out(counts: Floats, variance: float | Floats) -> Floats:
     """The part of log p that depends on counts and read noise alone."""
     k = np.maximum(np.rint(counts), 0.0)
-    few = gammaln(k + REACH + 1.0) + 0.5 * ((counts - k) ** 2 / variance + np.log(variance))
+    few = gammaln(k + 1.0) + 0.5 * ((counts - k) ** 2 / variance + np.log(variance))
     return -0.5 * math.log(2.0 * math.pi) - np.where(np.asarray(variance) < WIDE, few, 0.0)

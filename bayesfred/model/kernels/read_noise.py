@@ -162,7 +162,7 @@ def _clenshaw(series, x):
     return series[0] + x * value - before, value + x * slope - slope_before
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE)
 def _segment_density(noise, values, level, first):
     total = 0.0
     for i in range(values.size):
@@ -173,7 +173,7 @@ def _segment_density(noise, values, level, first):
     return total
 
 
-@inner(fastmath=REDUCE, error_model="numpy")
+@inner(fastmath=REDUCE)
 def _segment_score(noise, values, level, first):
     total = 0.0
     for i in range(values.size):
@@ -218,14 +218,14 @@ def _segment_sums(noise, values, level, informed, out):
             out[k] = _segment_density(noise, part, level, k * SEGMENT)
 
 
-@entry(fastmath=FAST, error_model="numpy")
+@entry(fastmath=FAST)
 def log_densities(noise, n, mu, out):
     """Log-densities of pixels, less what depends on the counts alone."""
     for i in range(out.size):
         out[i] = log_density(noise, n[i], mu[i], 0.0, np.uint64(i))
 
 
-@entry(fastmath=FAST, error_model="numpy")
+@entry(fastmath=FAST)
 def scores(noise, n, mu, out):
     """Derivatives of the log-densities by mu."""
     for i in range(out.size):
@@ -256,7 +256,7 @@ def most_likely(noise, n, out):
         out[i] = mu if n[i] > 0.5 else 0.0
 
 
-@entry(fastmath=FAST, error_model="numpy")
+@entry(fastmath=FAST)
 def _find_steps(n, variance, up, down):
     for i in range(n.size):
         up[i], down[i] = steps(n[i], 1.0 / variance[i])

@@ -3,13 +3,13 @@
 The formulas are those of `poisson_gaussian`. They take long chains of operations, each of which
 waits for the one before, and a processor works on a pixel's and its neighbours' chains at a time
 only if these are short. So a stretch is summed in several passes, whose results stay in the fastest
-cache in between. A table is read one number at a time, because instructions that gather several are
-slower. The logarithm of four pixels' factors is that of their product. Where some pixels need one
-formula and some the other, what a frame knows of them is sorted by formula beforehand, and a sum
-gathers their means alone.
+cache in between. What needs few digits is float32, of which a register holds twice as many: what is
+added to a sum has an error of 1e-8 by it. A table is read one number at a time, because
+instructions that gather several are slower. The logarithm of four pixels' factors is that of their
+product. Where some pixels need one formula and some the other, what a frame knows of them is sorted
+by formula beforehand, and a sum gathers their means alone.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,22 +20,23 @@ from numba.extending import overload
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import inner, leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log, split
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log
 from bayesfred.model.kernels.contexts import LIMIT, MASKED, STRETCH
 from bayesfred.model.kernels.cumulants import table_cell, table_value
 from bayesfred.model.kernels.noise_dispatch import part_of, scaled
 from bayesfred.model.kernels.poisson_gaussian import (
     LEAST,
-    REACH,
-    TINY,
+    LEAST_SINGLE,
+    SINGLE,
+    SINGLE_CORRECTION,
     correction,
     density_of,
     improved,
     nearest,
     photon_sum,
+    rough_log,
     rough_omega,
-    rough_x,
-    rougher_omega,
+    rough_tilt,
     tilted_mean,
 )
 
@@ -54,13 +55,13 @@ class Alike(NamedTuple):
     constants: tuple[Floats, ...]  # likewise; the sum's steps, or the variance of the read noise
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE)
 def _find_cells(table, values, mean, cells, places):
     """The cells of a stretch's pixels in the table of g, and the sum of -mu."""
     (image, level, response), total = mean, 0.0
     for i in range(image.size):
         n, mu = values[i], scaled(image[i] + level, response, i)
-        cell, places[i] = table_cell(table, n, log(max(mu, TINY)))
+        cell, places[i] = table_cell(table, n, log(max(mu, LEAST)))
         cells[i] = as_float(cell)
         less = -mu if mu >= 0.0 else MASKED
         total += less if n > LIMIT else 0.0
@@ -103,7 +104,7 @@ def _sum(x):
     return total
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE)
 def _sum_densities(kind, variance, values, mean):
     """The sum from the formulas, one pixel after another."""
     (image, level, response), total = mean, 0.0
@@ -139,58 +140,84 @@ def _sum_segments(table, noise, values, mean, place):
     return total
 
 
-@leaf(fastmath=FAST, error_model="numpy")
-def _find_x(variance, values, mean, x, inverse, mu):
-    """x, 1 / r^2 and the mean, which is MASKED where a pixel does not count."""
+@leaf(fastmath=FAST)
+def _in_singles(values, mean, mu, n, m):
+    """The mean, MASKED where a pixel does not count, and float32 counts and mean."""
     image, level, response = mean
     for i in range(image.size):
-        mu[i] = scaled(image[i] + level, response, i) if values[i] > LIMIT else MASKED
-        inverse[i] = 1.0 / variance[i]
-        x[i] = rough_x(values[i], max(mu[i], TINY), inverse[i])
+        counted, expected = values[i] > LIMIT, scaled(image[i] + level, response, i)
+        mu[i] = expected if counted else MASKED
+        n[i] = values[i] if counted else 0.0
+        m[i] = max(expected, LEAST)
+
+
+@leaf(fastmath=FAST)
+def _invert(variance, inverse):
+    for i in range(variance.size):
+        inverse[i] = SINGLE(1.0) / SINGLE(variance[i])
+
+
+@leaf(fastmath=FAST)
+def _find_x(slope, level, inverse):
+    """n / r^2, log(mu / r^2) and x, in place of n, mu and 1 / r^2."""
+    for i in range(inverse.size):
+        slope[i] *= inverse[i]
+        level[i] = rough_log(max(level[i] * inverse[i], LEAST_SINGLE))
+        inverse[i] = slope[i] + level[i]
 
 
 @leaf(fastmath=FAST)
 def _guess_omega(x, w):
     for i in range(x.size):
-        w[i] = rougher_omega(x[i])
+        w[i] = rough_omega(x[i])
 
 
-@leaf(fastmath=FAST, error_model="numpy")
-def _find_tilt(values, x, w, inverse):
-    """The tilts s in place of x."""
+@leaf(fastmath=FAST)
+def _compare_omega(level, x, w):
+    """log(w r^2 / mu) and x - log(w) - w."""
     for i in range(x.size):
-        x[i] = values[i] * inverse[i] - rough_omega(x[i], w[i])
+        log_w = rough_log(w[i])
+        level[i] = log_w - level[i]
+        x[i] -= log_w + w[i]
+
+
+@leaf(fastmath=FAST)
+def _find_tilts(slope, level, x, w):
+    """The tilts, in place of the slopes."""
+    for i in range(x.size):
+        slope[i] = rough_tilt(slope[i], level[i], x[i], w[i])
 
 
 @leaf(fastmath=FAST)
 def _find_means(mu, s, y):
     for i in range(s.size):
-        y[i] = tilted_mean(max(mu[i], TINY), s[i])
+        y[i] = tilted_mean(max(mu[i], LEAST), float(s[i]))
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
-def _sum_tilted(variance, values, mu, tilts, v):
-    """The sum of log p without log phi, and v = y + r^2."""
-    (s, y), total = tilts, 0.0
+@leaf(fastmath=REDUCE)
+def _sum_tilted(values, mu, variance, tilts, out):
+    """The sum of log p without log phi; v = y + r^2, q = 1 / v, 0 where nothing counts, and t."""
+    (s, y), (v, q, t), total = tilts, out, 0.0
     for i in range(mu.size):
-        term, _, _, spread = improved(values[i], mu[i], variance[i], s[i], y[i])
+        term, _, _, spread, inverse = improved(values[i], mu[i], variance[i], float(s[i]), y[i])
         counted = mu[i] > LIMIT
         v[i] = spread if counted else 1.0
+        inverse = inverse if counted else 0.0
+        q[i] = inverse
+        t[i] = 1.0 - 2.0 * variance[i] * inverse
         term = term if mu[i] >= 0.0 else MASKED
         total += term if counted else 0.0
     return total
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
-def _sum_corrections(variance, mu, v):
-    total = 0.0
-    for i in range(v.size):
-        term = correction(v[i], variance[i])
-        total += term if mu[i] > LIMIT else 0.0
-    return total
+@leaf(fastmath=FAST)
+def _find_corrections(q, t):
+    """What the expansion of log phi adds, in place of q."""
+    for i in range(q.size):
+        q[i] = correction(SINGLE_CORRECTION, q[i], t[i])
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE)
 def _sum_logs(q):
     quarter, total = q.size // 4, 0.0
     for i in range(quarter):
@@ -202,25 +229,26 @@ def _sum_logs(q):
 @leaf()
 def _sum_expansion(variance, values, mean, scratch):
     """The sum of the saddlepoint expansion over pixels that differ in their read noise."""
-    total = 0.0
+    one, two, total = scratch[0].view(SINGLE), scratch[1].view(SINGLE), 0.0
     for a in range(0, values.size, STRETCH):
         n, r = values[a : a + STRETCH], variance[a : a + STRETCH]
-        s, y, v, mu = (
-            scratch[0, : n.size],
-            scratch[1, : n.size],
-            scratch[2, : n.size],
-            scratch[3, : n.size],
-        )
-        _find_x(r, n, part_of(mean, a, n.size), s, v, mu)
-        _guess_omega(s, y)
-        _find_tilt(n, s, y, v)
-        _find_means(mu, s, y)
-        total += _sum_tilted(r, n, mu, (s, y), v)
-        total += _sum_corrections(r, mu, v) - 0.5 * _sum_logs(v)
+        slope, level = one[: n.size], one[STRETCH : STRETCH + n.size]
+        x, w = two[: n.size], two[STRETCH : STRETCH + n.size]
+        y, v, mu = scratch[2, : n.size], scratch[5, : n.size], scratch[3, : n.size]
+        _in_singles(n, part_of(mean, a, n.size), mu, slope, level)
+        _invert(r, x)
+        _find_x(slope, level, x)
+        _guess_omega(x, w)
+        _compare_omega(level, x, w)
+        _find_tilts(slope, level, x, w)
+        _find_means(mu, slope, y)
+        total += _sum_tilted(n, mu, r, (slope, y), (v, x, w))
+        _find_corrections(x, w)
+        total += _sum(x) - 0.5 * _sum_logs(v)
     return total
 
 
-@leaf(fastmath=FAST, error_model="numpy")
+@leaf(fastmath=FAST)
 def _find_sums(steps, values, mean, sums, mu):
     """The photon sums, and the mean, which is MASKED where a pixel does not count."""
     (up, down), (image, level, response) = steps, mean
@@ -229,16 +257,14 @@ def _find_sums(steps, values, mean, sums, mu):
         sums[i] = photon_sum(nearest(values[i]), max(mu[i], LEAST), up[i], down[i])
 
 
-@leaf(fastmath=REDUCE, error_model="numpy")
+@leaf(fastmath=REDUCE)
 def _sum_powers(values, mu, sums):
-    """The sum of log p without the mantissas of the photon sums, and these in their place."""
+    """The sum of k log(mu) - mu, and photon sums of 1 where a pixel does not count."""
     total = 0.0
     for i in range(mu.size):
-        exponent, mantissa = split(sums[i])
-        term = (nearest(values[i]) - REACH) * log(max(mu[i], LEAST)) - mu[i]
-        term += exponent * math.log(2.0)
+        term = nearest(values[i]) * log(max(mu[i], LEAST)) - mu[i]
         counted = mu[i] > LIMIT
-        sums[i] = mantissa if counted else 1.0
+        sums[i] = sums[i] if counted else 1.0
         term = term if mu[i] >= 0.0 else MASKED
         total += term if counted else 0.0
     return total
