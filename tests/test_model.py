@@ -74,6 +74,7 @@ def make_truth(
         "offset_x": 0.7,
         "offset_y": -0.4,
         "psf_sigma": 1.04 * model.psf.sigma,
+        "model_error": 0.03,
         **dict(zip(names, slopes, strict=True)),
     }
 

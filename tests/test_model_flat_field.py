@@ -67,9 +67,7 @@ def test_log_prob_is_that_of_the_recorded_counts(case: str) -> None:
         mean = dense_image(posterior.model, named) + background_image(SHAPE, named)
         terms = plain.log_likelihood(recorded, FLAT * mean, 0.0)[posterior.mask]
         value = posterior.log_prob(params) - posterior.log_prior(params)[0]
-        # a map's pixels are summed with corrections in single precision
-        precision = 1e-9 if case == "map" else 1e-11
-        assert value == pytest.approx(float(terms.sum()) + density, rel=precision)
+        assert value == pytest.approx(float(terms.sum()) + density, rel=1e-11)
         params[level] /= factor
     params[level] = -1.0
     assert posterior.log_prob(params) == -math.inf

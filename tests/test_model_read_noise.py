@@ -297,8 +297,7 @@ def test_map_of_equal_read_noises_is_one_read_noise() -> None:
         mask=posterior.mask,
         nuisances=posterior.nuisances,
     )
-    # a map's pixels are summed with corrections in single precision
-    assert equal.log_prob(params) == pytest.approx(posterior.log_prob(params), abs=1e-6)
+    assert equal.log_prob(params) == pytest.approx(posterior.log_prob(params), abs=1e-8)
     assert equal.fisher(params) == pytest.approx(posterior.fisher(params), rel=1e-9)
     fit, fit_equal = fit_statistics(posterior, params), fit_statistics(equal, params)
     assert fit == pytest.approx(fit_equal, rel=1e-9)

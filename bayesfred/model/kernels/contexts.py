@@ -57,7 +57,7 @@ class Workspace(NamedTuple):
     ratio: Floats
     # what profiling fills again on every call, kept because new memory costs more than its use
     heap: Floats
-    scratch: Floats  # (6, STRETCH)
+    scratch: Floats  # (5, STRETCH)
 
 
 class Vectors(NamedTuple):

@@ -51,7 +51,7 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
     flags = np.zeros(size // SEGMENT, np.uint8)
     image, score, heap = map(_aligned, (size, size, more))
     weight, ratio = (score, _aligned(0)) if free is None else map(_aligned, (size, size))
-    scratch = _aligned(6 * STRETCH).reshape(6, STRETCH)
+    scratch = _aligned(5 * STRETCH).reshape(5, STRETCH)
     return Workspace(image, flags, span, score, weight, ratio, heap, scratch)
 
 

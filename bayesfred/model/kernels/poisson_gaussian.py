@@ -60,23 +60,21 @@ FARTHEST = 35.0  # exponents of a step's factors: smaller ones than exp(-35) cha
 SINGLE = np.float32  # serves what is rough anyway
 LEAST_SINGLE = SINGLE(1e-37)  # of float32 numbers that are normal
 
-# log phi + 1/2 log(2 pi v): coefficients of (1 + t) q^i t^j, t = 2 rho - 1, a row for i = 1, 2, 3
+# log phi + 1/2 log(2 pi v): coefficients of q^i rho^j, a row for i = 1, 2, 3, from j = 1 on
 CORRECTION = (
-    (1 / 96, -5 / 96),
-    (0.0011742659087037206, -0.013882381786950147, -0.005018124465439425, 0.019869442864951337),
-    (0.00046817276752711455, -0.011384207538163282, -0.00566020437365114, 0.05652583764187838,
-     -0.004078308307542466, -0.13387604788596819, -0.03701071010205914, 0.09486940798742682,
-     0.053007545936324646),
+    (1 / 8, -5 / 24),
+    (-0.01966183926947379, 0.22304878295513086, -0.5170116244823475, 0.3179110858392214),
+    (0.0011830114308505552, -0.08585417212460593, 0.6067678293230436, -2.779207981131074,
+     16.007686898374327, -56.830514686197134, 100.23868418598953, -84.27288563281161,
+     27.13986351939822),
 )  # fmt: skip
-SINGLE_CORRECTION = tuple(tuple(map(SINGLE, row)) for row in CORRECTION)
 
 
 def _correction_table() -> Floats:
     """The coefficients of q^i tau^j, tau = 1 - rho, times (i + j)^n: shape (n, i, j)."""
     out = np.zeros((4, 3, 10))
     for i, row in enumerate(CORRECTION):
-        rho = np.polynomial.Polynomial([1.0, -1.0])
-        in_tau = (np.polynomial.Polynomial(row)(2.0 * rho - 1.0) * (2.0 * rho)).coef
+        in_tau = np.polynomial.Polynomial([0.0, *row])(np.polynomial.Polynomial([1.0, -1.0])).coef
         for n in range(4):
             power = np.arange(in_tau.size, dtype=np.float64) + (i + 1)
             out[n, i, : in_tau.size] = np.asarray(in_tau, dtype=float) * power**n
@@ -259,7 +257,7 @@ def tilted_mean(mu, s):
 
 @inner(fastmath=FAST, forceinline=True)
 def improved(n, mu, variance, s, y):
-    """log p without log phi from rough s and y, s, y and v = y + r^2 to 1e-11, and 1 / v to 1e-5.
+    """log p without log phi from rough s and y, and s, y and v = y + r^2 to 1e-11.
 
     log p is stationary in s, so that the change of s counts by its square.
     """
@@ -271,27 +269,27 @@ def improved(n, mu, variance, s, y):
     term = y - mu + s * (0.5 * tilt - n) - less * change * (0.5 + third)
     change *= 1.0 + change * rho * (0.5 + change * (0.5 * rho - 1.0 / 6.0))
     less -= variance * change  # y + r^2 s = n
-    v = total - less
-    return term, s - change, y - less, v, q * (2.0 - q * v)
+    return term, s - change, y - less, total - less
 
 
 @inner(fastmath=FAST, forceinline=True)
-def correction(coefficients, q, t):
-    """log phi + 1/2 log(2 pi v), in the type of all numbers; t = 2 rho - 1."""
-    one, two, three = coefficients
+def correction(v, variance):
+    """log phi + 1/2 log(2 pi v)."""
+    q = 1.0 / v
+    rho = 1.0 - variance * q
+    one, two, three = CORRECTION
     total = three[8]
     for j in range(7, -1, -1):
-        total = total * t + three[j]
+        total = total * rho + three[j]
     by = two[3]
     for j in range(2, -1, -1):
-        by = by * t + two[j]
-    first = one[0] + t * one[1]
-    return (q + t * q) * (first + q * (by + q * total))
+        by = by * rho + two[j]
+    return rho * q * (one[0] + rho * one[1] + q * (by + q * total))
 
 
 @inner(fastmath=FAST, forceinline=True)
 def _tilt(n, mu, variance):
-    """As `improved`, from the rough tilt."""
+    """log p without log phi, and s, y and v to 1e-11."""
     inverse = SINGLE(1.0 / variance)
     slope = SINGLE(n) * inverse
     level = rough_log(max(SINGLE(mu) * inverse, LEAST_SINGLE))
@@ -304,9 +302,8 @@ def _tilt(n, mu, variance):
 @inner(fastmath=FAST, forceinline=True)
 def _tilted_density(n, mu, variance):
     """log p of the saddlepoint expansion, less -1/2 log(2 pi)."""
-    term, _, _, v, _ = _tilt(n, max(mu, LEAST), variance)
-    q = 1.0 / v
-    return term - 0.5 * log(v) + correction(CORRECTION, q, 1.0 - 2.0 * variance * q)
+    term, _, _, v = _tilt(n, max(mu, LEAST), variance)
+    return term - 0.5 * log(v) + correction(v, variance)
 
 
 @inner(fastmath=FAST, forceinline=True)
@@ -317,7 +314,7 @@ def _tilted_derivatives(n, mu, variance):
     and M = q d/dq, L y = y tau and L = -rho tau M for functions of q.
     """
     mu = max(mu, LEAST)
-    _, s, y, v, _ = _tilt(n, mu, variance)
+    _, s, y, v = _tilt(n, mu, variance)
     y = mu * _exp(s - (y + variance * s - n) / v)  # to rounding
     q = 1.0 / (y + variance)
     tau, rho = variance * q, y * q

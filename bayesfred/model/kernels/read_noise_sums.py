@@ -3,11 +3,11 @@
 The formulas are those of `poisson_gaussian`. They take long chains of operations, each of which
 waits for the one before, and a processor works on a pixel's and its neighbours' chains at a time
 only if these are short. So a stretch is summed in several passes, whose results stay in the fastest
-cache in between. What needs few digits is float32, of which a register holds twice as many: what is
-added to a sum has an error of 1e-8 by it. A table is read one number at a time, because
-instructions that gather several are slower. The logarithm of four pixels' factors is that of their
-product. Where some pixels need one formula and some the other, what a frame knows of them is sorted
-by formula beforehand, and a sum gathers their means alone.
+cache in between. What needs few digits is float32, of which a register holds twice as many. A table
+is read one number at a time, because instructions that gather several are slower. The logarithm of
+four pixels' factors is that of their product. Where some pixels need one formula and some the
+other, what a frame knows of them is sorted by formula beforehand, and a sum gathers their means
+alone.
 """
 
 from typing import Any, NamedTuple
@@ -28,7 +28,6 @@ from bayesfred.model.kernels.poisson_gaussian import (
     LEAST,
     LEAST_SINGLE,
     SINGLE,
-    SINGLE_CORRECTION,
     correction,
     density_of,
     improved,
@@ -195,26 +194,25 @@ def _find_means(mu, s, y):
 
 
 @leaf(fastmath=REDUCE)
-def _sum_tilted(values, mu, variance, tilts, out):
-    """The sum of log p without log phi; v = y + r^2, q = 1 / v, 0 where nothing counts, and t."""
-    (s, y), (v, q, t), total = tilts, out, 0.0
+def _sum_tilted(variance, values, mu, tilts, v):
+    """The sum of log p without log phi, and v = y + r^2."""
+    (s, y), total = tilts, 0.0
     for i in range(mu.size):
-        term, _, _, spread, inverse = improved(values[i], mu[i], variance[i], float(s[i]), y[i])
+        term, _, _, spread = improved(values[i], mu[i], variance[i], float(s[i]), y[i])
         counted = mu[i] > LIMIT
         v[i] = spread if counted else 1.0
-        inverse = inverse if counted else 0.0
-        q[i] = inverse
-        t[i] = 1.0 - 2.0 * variance[i] * inverse
         term = term if mu[i] >= 0.0 else MASKED
         total += term if counted else 0.0
     return total
 
 
-@leaf(fastmath=FAST)
-def _find_corrections(q, t):
-    """What the expansion of log phi adds, in place of q."""
-    for i in range(q.size):
-        q[i] = correction(SINGLE_CORRECTION, q[i], t[i])
+@leaf(fastmath=REDUCE)
+def _sum_corrections(variance, mu, v):
+    total = 0.0
+    for i in range(v.size):
+        term = correction(v[i], variance[i])
+        total += term if mu[i] > LIMIT else 0.0
+    return total
 
 
 @leaf(fastmath=REDUCE)
@@ -234,7 +232,8 @@ def _sum_expansion(variance, values, mean, scratch):
         n, r = values[a : a + STRETCH], variance[a : a + STRETCH]
         slope, level = one[: n.size], one[STRETCH : STRETCH + n.size]
         x, w = two[: n.size], two[STRETCH : STRETCH + n.size]
-        y, v, mu = scratch[2, : n.size], scratch[5, : n.size], scratch[3, : n.size]
+        # v has the room of x and w
+        y, v, mu = scratch[2, : n.size], scratch[1, : n.size], scratch[3, : n.size]
         _in_singles(n, part_of(mean, a, n.size), mu, slope, level)
         _invert(r, x)
         _find_x(slope, level, x)
@@ -242,9 +241,8 @@ def _sum_expansion(variance, values, mean, scratch):
         _compare_omega(level, x, w)
         _find_tilts(slope, level, x, w)
         _find_means(mu, slope, y)
-        total += _sum_tilted(n, mu, r, (slope, y), (v, x, w))
-        _find_corrections(x, w)
-        total += _sum(x) - 0.5 * _sum_logs(v)
+        total += _sum_tilted(r, n, mu, (slope, y), v)
+        total += _sum_corrections(r, mu, v) - 0.5 * _sum_logs(v)
     return total
 
 
