@@ -235,6 +235,25 @@ def test_wide_frames_and_extreme_pixels_are_summed_pixel_by_pixel(case: str) -> 
         assert np.isfinite(noise.log_likelihood(counts, np.full(WIDE, 1e-12), 0.0)).all()
 
 
+@pytest.mark.parametrize("least", [0.1, 0.9])
+def test_counts_that_no_mean_explains_are_summed_as_pixels(least: float) -> None:
+    """Four pixels' sums are multiplied before their logarithm is taken, and must not overflow."""
+    shape, rng = (21, 48), np.random.default_rng(712)
+    source = SourceCatalog([0.0], [0.0], [100.0])
+    distortion = PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)])
+    model = ForwardModel(Detector(shape), source, GaussianPSF(1.4), distortion)
+    noise = PoissonNoise(rng.uniform(least, 0.95, shape))
+    counts = noise.draw(model.expected_counts([0.0, 0.0], 5.0), 0.0, rng)
+    counts[10, 17:20], counts[10, 28:32] = 2e4, 3e4
+    posterior = Posterior(model, counts, noise=noise)
+    for background in (1e-3, 1e-20):
+        params = np.array([0.0, 0.0, background])
+        value = posterior.log_prob(params) - posterior.log_prior(params)[0]
+        image = model.expected_counts([0.0, 0.0], background)
+        terms = noise.log_likelihood(counts, image, 0.0)
+        assert value == pytest.approx(math.fsum(terms.ravel()), rel=1e-9)
+
+
 NARROW = (13, 1103)  # no multiples of anything
 TAIL = np.where(RNG.random(NARROW) < 0.05, RNG.uniform(2.0, 6.0, NARROW), 0.0)
 SIDES: dict[str, Floats] = {
