@@ -15,6 +15,7 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.model.kernels.contexts import Clusters, Rendered
 from bayesfred.model.kernels.extrapolate import Extrapolated, describe
+from bayesfred.model.near_mean import whitening
 
 
 class FluxExtrapolation(NamedTuple):
@@ -47,9 +48,8 @@ def flux_extrapolation(
     Along axes on which there are none, because the map folds or the background ends, they are taken
     as constant. z is that of `kernels/gradient.py`. Without a covariance there is no extrapolation.
     """
-    try:
-        axes = linalg.cholesky(covariance, lower=True)
-    except (ValueError, linalg.LinAlgError):
+    axes = whitening(covariance)
+    if axes is None:
         return None
     change = np.stack(
         [0.5 * (fluxes_at(params + axis) - fluxes_at(params - axis)) for axis in axes.T], axis=1

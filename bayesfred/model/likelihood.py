@@ -36,6 +36,7 @@ from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
 from bayesfred.model.kernels.sources import OwnPixels, own_pixels
+from bayesfred.model.near_mean import Around, noise_near
 from bayesfred.model.noise import ModelErrorNoise, Noise
 from bayesfred.model.parameters import (
     BACKGROUND_TERMS,
@@ -80,8 +81,9 @@ class FrameLikelihood:
         The table, in the order of every parameter vector.
     narrowest : float, optional, pixel
         Width of the narrowest PSF for which pixels have to be integrated well.
-    extrapolation : FluxExtrapolation, optional
-        Where free fluxes have their maximum, near some parameters; see `near`.
+    extrapolation : FluxExtrapolation or Around, optional
+        Near some parameters, where free fluxes have their maximum; or with fixed fluxes, these
+        parameters. See `near`.
     occam : OccamFactor, optional
         What a PSF that was measured on the frame says of the model error.
     """
@@ -93,7 +95,7 @@ class FrameLikelihood:
     nuisances: Nuisances
     parameters: tuple[Parameter, ...]
     narrowest: float | None = None
-    extrapolation: FluxExtrapolation | None = None
+    extrapolation: FluxExtrapolation | Around | None = None
     occam: OccamFactor | None = None
 
     def log_likelihood(self, vectors: Floats, wanted: Flags) -> Floats:
@@ -103,7 +105,7 @@ class FrameLikelihood:
         """
         out = np.where(wanted, 0.0, -np.inf)
         arguments, rows = self._arguments(vectors), np.arange(len(vectors))
-        if self.extrapolation:
+        if isinstance(self.extrapolation, FluxExtrapolation):
             known = {"extrapolated": self.extrapolation.at(vectors)}
             self._evaluate(partial(extrapolated_log_likelihoods, **known), arguments, out)
             rows = np.flatnonzero(np.isnan(out))
@@ -120,7 +122,7 @@ class FrameLikelihood:
 
         def work() -> None:
             with self._workspace() as w:
-                kernel(self._problem, w, vectors, turns=turns)
+                kernel(self._near_problem, w, vectors, turns=turns)
 
         if out.size:  # what nothing needs is not compiled
             share(work, len(out))
@@ -130,6 +132,8 @@ class FrameLikelihood:
 
         See `Posterior.near`.
         """
+        if not self.nuisances.profiled and hasattr(self._frame.noise, "near"):
+            return self._with(Around(params, covariance))
         if self.nuisances.profiled != 1:
             return self
         out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
@@ -137,10 +141,16 @@ class FrameLikelihood:
             slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if not np.isfinite(slopes[0]):
             return replace(self, extrapolation=None)
-        known = flux_extrapolation(self.model, self.fluxes, rendered, z[:, 0], params, covariance)
-        close = replace(self, extrapolation=known)
+        return self._with(
+            flux_extrapolation(self.model, self.fluxes, rendered, z[:, 0], params, covariance)
+        )
+
+    def _with(self, extrapolation: FluxExtrapolation | Around | None) -> "FrameLikelihood":
+        close = replace(self, extrapolation=extrapolation)
         # what is made of a frame is large
-        vars(close).update({name: made for name, made in vars(self).items() if name[0] == "_"})
+        made = {name: each for name, each in vars(self).items() if name[0] == "_"}
+        made.pop("_near_problem", None)
+        vars(close).update(made)
         return close
 
     def share_workspaces(self, other: "FrameLikelihood") -> None:
@@ -385,6 +395,14 @@ class FrameLikelihood:
     def _problem(self) -> Problem:
         flux, shape = self.model.sources.flux, self.nuisances.flux_shape
         return Problem(self._optics, self._frame, flux, shape, self._faint, self._free)
+
+    @cached_property
+    def _near_problem(self) -> Problem:
+        """The problem with the noise as it is near the parameters of `near`."""
+        if not isinstance(self.extrapolation, Around):
+            return self._problem
+        noise = noise_near(self._frame, self.expected_counts, self.extrapolation)
+        return self._problem._replace(frame=self._frame._replace(noise=noise))
 
     @cached_property
     def _frame(self) -> Frame:

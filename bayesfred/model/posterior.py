@@ -22,6 +22,7 @@ from bayesfred.model import priors
 from bayesfred.model.extrapolation import FluxExtrapolation
 from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.likelihood import FrameLikelihood
+from bayesfred.model.near_mean import Around
 from bayesfred.model.noise import Noise, PoissonNoise
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
 from bayesfred.model.pixels import usable_pixels
@@ -90,7 +91,7 @@ class Posterior(FrameDensity):
     noise: Noise
     mask: Flags
     nuisances: Nuisances
-    extrapolation: FluxExtrapolation | None = field(metadata={"stored": False})
+    extrapolation: FluxExtrapolation | Around | None = field(metadata={"stored": False})
     valid: Flags = field(metadata={"stored": False})
     psf_errors: PsfErrors | None = field(metadata={"since": 6})
 
@@ -103,7 +104,7 @@ class Posterior(FrameDensity):
         noise: Noise = PoissonNoise(),
         mask: npt.ArrayLike | None = None,
         nuisances: Nuisances = Nuisances(),
-        extrapolation: FluxExtrapolation | None = None,
+        extrapolation: FluxExtrapolation | Around | None = None,
         valid: npt.ArrayLike | None = None,
         psf_errors: PsfErrors | None = None,
     ) -> None:
@@ -113,7 +114,9 @@ class Posterior(FrameDensity):
         if valid is None:
             valid = finite & (True if mask is None else mask)
         valid = used if np.array_equal(valid, used) else np.array(valid, dtype=bool)
-        if extrapolation is not None and extrapolation.model is not model:
+        if (
+            isinstance(extrapolation, FluxExtrapolation) and extrapolation.model is not model
+        ):
             raise InputError(
                 "extrapolation: got that of another model, expected this one's: leave it out"
             )

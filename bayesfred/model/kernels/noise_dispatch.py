@@ -21,6 +21,12 @@ response is None:
                                       the sum of log_density; `mean` is (image, level, response),
                                       `place` the first pixel's, and the `scratch` of `Workspace`
 
+A model whose log_density takes long has a field `near`, a `MeanSeries`. It is empty unless the
+frame is to be evaluated near known means. Where it serves, `summed` is not called. What never needs
+it calls
+
+    summed_exactly(noise, values, light, mean, place)
+
 Where the background is constant, it may spare the loops the pixels that no source reaches:
 
     unreached(noise, rest, level)     the sum of log_density over them, its derivative in the level,
@@ -46,9 +52,13 @@ from numba import types
 from numba.extending import overload
 
 from bayesfred.imaging.kernels.compilation import leaf
+from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.psf_dispatch import by_type
-from bayesfred.model.kernels.contexts import LIMIT
+from bayesfred.model.kernels.contexts import LIMIT, STRETCH
+from bayesfred.model.kernels.mean_series import BLOCK, sum_polynomials
+
+MANY = 64.0  # pixels out of range, for which a whole stretch is summed by the formula
 
 
 def _optional(name: str, default: Callable[..., Any]) -> Callable[..., Any]:
@@ -130,7 +140,41 @@ def _no_information(noise, mu, light, p):
     return 0.0
 
 
-summed = _optional("summed", _pixel_by_pixel)
+summed_exactly = _optional("summed", _pixel_by_pixel)
+
+
+def _summed_near(noise, values, light, mean, place):
+    """The sum from the polynomials of `near`, but for the pixels out of their range.
+
+    Where these are few, only their segments are summed by the formula.
+    """
+    blocks, constants = noise.near
+    total, a, step = 0.0, 0, STRETCH if constants.size else values.size
+    while a < values.size:
+        b = min(a + step, values.size)
+        value, outside = 0.0, MANY
+        if constants.size:
+            i, j = (place[0] + a) // SEGMENT, (place[0] + b) // SEGMENT
+            block = blocks[i * BLOCK : j * BLOCK]
+            value, outside = sum_polynomials(block, constants[i:j], mean[0][a:b], mean[1])
+        if 0.0 < outside < MANY and b - a > SEGMENT:
+            step = SEGMENT
+            continue
+        if outside > 0.0:
+            first = place[0] + a
+            part = part_of(mean, a, b - a)
+            value = summed_exactly(noise, values[a:b], light[a:b], part, (first, place[1]))
+        total += value
+        a = b
+        step = step if a % STRETCH else STRETCH
+    return total
+
+
+summed = by_type(
+    lambda family: _summed_near
+    if hasattr(family, "near")
+    else getattr(family, "summed", _pixel_by_pixel)
+)
 spread = by_type(lambda family: family.spread)
 given = _optional("given", _same)
 

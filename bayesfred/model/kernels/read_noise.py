@@ -19,6 +19,7 @@ from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
 from bayesfred.model.kernels.cumulants import CumulantTable
+from bayesfred.model.kernels.mean_series import MeanSeries, no_mean_series
 from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
 from bayesfred.model.kernels.poisson_gaussian import (
     WIDE,
@@ -66,6 +67,7 @@ class ReadNoiseTerms(NamedTuple):
     table: Floats
     level: LevelSeries
     cumulants: CumulantTable | None  # of a frame with one read noise
+    near: MeanSeries
 
     @staticmethod
     def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
@@ -320,4 +322,6 @@ def new_terms(
     variance: float | Floats, rows: InformationRows, row: float | Floats
 ) -> ReadNoiseTerms:
     """The compiled half for pixels in the order in which they are given, without a frame."""
-    return ReadNoiseTerms(kind_of(variance), variance, None, None, row, *rows, no_series(), None)
+    return ReadNoiseTerms(
+        kind_of(variance), variance, None, None, row, *rows, no_series(), None, no_mean_series()
+    )

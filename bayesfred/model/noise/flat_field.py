@@ -22,12 +22,13 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.io.serialize import serializable
 from bayesfred.model.kernels.contexts import LIMIT, MASKED
+from bayesfred.model.kernels.mean_series import MeanSeries, no_mean_series
 from bayesfred.model.kernels.noise_dispatch import (
     derivatives,
     information,
     log_density,
     spread,
-    summed,
+    summed_exactly,
 )
 from bayesfred.model.kernels.read_noise import LevelSeries, level_series, no_series, sum_unreached
 from bayesfred.model.noise.poisson import PoissonNoise
@@ -43,6 +44,7 @@ class FlatFieldTerms(NamedTuple):
     counts: Floats  # (ny * stride,) themselves, MASKED where a pixel is not used
     response: Floats  # (ny * stride,)
     level: LevelSeries
+    near: MeanSeries
 
     @staticmethod
     def log_density(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
@@ -53,7 +55,7 @@ class FlatFieldTerms(NamedTuple):
     def summed(noise: Any, values: Any, light: Any, mean: Any, place: Any) -> Any:
         a, b = place[0], place[0] + values.size
         scaled = (mean[0], mean[1], noise.response[a:b])
-        return summed(noise.base, noise.counts[a:b], light, scaled, place)
+        return summed_exactly(noise.base, noise.counts[a:b], light, scaled, place)
 
     @staticmethod
     def derivatives(noise: Any, n: Any, mu: Any, light: Any, p: Any) -> Any:
@@ -152,7 +154,7 @@ class FlatFieldNoise(Noise):
         response[:, : self.response.shape[1]] = self.response
         counts = np.where(values > LIMIT, values * response, MASKED)
         return FlatFieldTerms(
-            self.noise.terms(counts), counts.ravel(), response.ravel(), no_series()
+            self.noise.terms(counts), counts.ravel(), response.ravel(), no_series(), no_mean_series()
         )
 
     def with_unreached(self, terms: FlatFieldTerms, values: Floats) -> FlatFieldTerms:
