@@ -203,8 +203,10 @@ def main() -> int:
     def exp() -> object:
         return np.exp(x, out=out)
 
-    def with_noise(noise: object) -> Callable[[], object]:
+    def with_noise(noise: object, *, near: bool) -> Callable[[], object]:
         noisy = bf.Posterior(m, bf.simulate(m, THETA, 5.0, seed=1, noise=noise), noise=noise)
+        if near:
+            noisy = noisy.near(truth, np.linalg.inv(noisy.fisher(truth)))
         return with_threads(1, lambda: noisy.log_prob(truth))
 
     pixels, side = np.random.default_rng(1), m.detector.shape
@@ -265,10 +267,15 @@ def main() -> int:
         ),
         *(
             (
-                f"log-posterior, {name} / photon noise",
-                ratio(with_noise(noise), with_threads(1, lambda: posterior.log_prob(truth)), 40),
-                1.5,
+                f"log-posterior, {name}{how} / photon noise",
+                ratio(
+                    with_noise(noise, near=near),
+                    with_threads(1, lambda: posterior.log_prob(truth)),
+                    40,
+                ),
+                bound,
             )
+            for near, how, bound in ((False, "", 1.5), (True, ", as `sample` evaluates it", 1.2))
             for name, noise in (
                 ("read noise 0.5", bf.PoissonNoise(0.5)),
                 ("read noise 2", bf.PoissonNoise(2.0)),

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
 from bayesfred.model.kernels.sources import OwnPixels, own_pixels
-from bayesfred.model.near_mean import Around, noise_near
+from bayesfred.model.near_mean import Around, problem_near
 from bayesfred.model.noise import ModelErrorNoise, Noise
 from bayesfred.model.parameters import (
     BACKGROUND_TERMS,
@@ -48,6 +48,7 @@ from bayesfred.model.parameters import (
     displacing,
 )
 from bayesfred.model.pixels import (
+    Expected,
     counts_constant,
     faint_fluxes,
     padded_frame,
@@ -55,14 +56,6 @@ from bayesfred.model.pixels import (
 )
 from bayesfred.model.psf_errors import OccamFactor
 from bayesfred.model.threads import share
-
-
-class Expected(NamedTuple):
-    """Expected counts; NaN where a map folds."""
-
-    light: Floats  # (ny, nx) of the sources, counts per pixel
-    level: Floats  # (ny, nx) of the background
-    fluxes: Floats  # (s,) counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +75,7 @@ class FrameLikelihood:
     narrowest : float, optional, pixel
         Width of the narrowest PSF for which pixels have to be integrated well.
     extrapolation : FluxExtrapolation or Around, optional
-        Near some parameters, where free fluxes have their maximum; or with fixed fluxes, these
-        parameters. See `near`.
+        What `near` knows of the parameters around which the likelihood is evaluated.
     occam : OccamFactor, optional
         What a PSF that was measured on the frame says of the model error.
     """
@@ -118,20 +110,17 @@ class FrameLikelihood:
         return out + self._constant
 
     def _evaluate(self, kernel: Callable[..., None], vectors: Vectors, out: Floats) -> None:
-        turns = Turns(np.zeros(1, np.int64), out)
+        problem, turns = self.near_problem, Turns(np.zeros(1, np.int64), out)
 
         def work() -> None:
             with self._workspace() as w:
-                kernel(self._near_problem, w, vectors, turns=turns)
+                kernel(problem, w, vectors, turns=turns)
 
         if out.size:  # what nothing needs is not compiled
             share(work, len(out))
 
     def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
-        """The same likelihood, evaluated several times faster around `params` if fluxes are free.
-
-        See `Posterior.near`.
-        """
+        """The same likelihood, faster to evaluate around `params`: see `Posterior.near`."""
         if not self.nuisances.profiled and hasattr(self._frame.noise, "near"):
             return self._with(Around(params, covariance))
         if self.nuisances.profiled != 1:
@@ -141,16 +130,12 @@ class FrameLikelihood:
             slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if not np.isfinite(slopes[0]):
             return replace(self, extrapolation=None)
-        return self._with(
-            flux_extrapolation(self.model, self.fluxes, rendered, z[:, 0], params, covariance)
-        )
+        known = flux_extrapolation(self.model, self.fluxes, rendered, z[:, 0], params, covariance)
+        return self._with(known)
 
     def _with(self, extrapolation: FluxExtrapolation | Around | None) -> "FrameLikelihood":
         close = replace(self, extrapolation=extrapolation)
-        # what is made of a frame is large
-        made = {name: each for name, each in vars(self).items() if name[0] == "_"}
-        made.pop("_near_problem", None)
-        vars(close).update(made)
+        vars(close).update((k, made) for k, made in vars(self).items() if k[0] == "_")  # large
         return close
 
     def share_workspaces(self, other: "FrameLikelihood") -> None:
@@ -397,12 +382,11 @@ class FrameLikelihood:
         return Problem(self._optics, self._frame, flux, shape, self._faint, self._free)
 
     @cached_property
-    def _near_problem(self) -> Problem:
-        """The problem with the noise as it is near the parameters of `near`."""
+    def near_problem(self) -> Problem:
+        """The problem as `log_likelihood` has it; not that of others that `near` makes."""
         if not isinstance(self.extrapolation, Around):
             return self._problem
-        noise = noise_near(self._frame, self.expected_counts, self.extrapolation)
-        return self._problem._replace(frame=self._frame._replace(noise=noise))
+        return problem_near(self._problem, self.expected_counts, self.extrapolation)
 
     @cached_property
     def _frame(self) -> Frame:

@@ -1,4 +1,4 @@
-"""The noise of a frame as it is near one parameter vector, see `kernels/mean_series`.
+"""The likelihood of a frame as it is near one parameter vector, see `kernels/mean_series`.
 
 There the mean of a pixel varies by s, the standard deviation that the parameters give it. A draw at
 a distance of z standard deviations in whitened parameters moves no mean by more than z s, to first
@@ -7,16 +7,16 @@ order. The distance of draws in d dimensions is about sqrt(d).
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg
 
 from bayesfred._typing import Floats
-from bayesfred.model.kernels.contexts import Frame
+from bayesfred.model.kernels.contexts import Problem
 from bayesfred.model.kernels.expansion_of_mean import expand
 
-FARTHER = 6.0  # standard deviations beyond sqrt(d) up to which the polynomials serve
+FARTHER = 5.0  # standard deviations beyond sqrt(d) up to which the polynomials serve
 
 
 class Around(NamedTuple):
@@ -34,21 +34,22 @@ def whitening(covariance: Floats) -> Floats | None:
         return None
 
 
-def noise_near(frame: Frame, mean_at: Callable[[Floats], Floats], around: Around) -> Any:
-    """The compiled half of the frame's noise with polynomials about the mean at `around.params`.
+def problem_near(problem: Problem, mean_at: Callable[[Floats], Floats], around: Around) -> Problem:
+    """The problem with polynomials for log p about the mean at `around.params`.
 
     It is the same where the mean is not finite there. Along whitened axes on which it is not, the
     mean is taken as constant.
     """
+    frame = problem.frame
     axes, mean = whitening(around.covariance), mean_at(around.params)
     if axes is None or not np.isfinite(mean).all():
-        return frame.noise
+        return problem
     variance = np.zeros(mean.shape)
     for axis in axes.T:
         variance += np.square(np.nan_to_num(mean_at(around.params + axis) - mean))
     change = np.zeros((frame.ny, frame.values.size // frame.ny))
     about = np.ones_like(change)
-    change[:, : frame.nx] = (math.sqrt(axes.shape[0]) + FARTHER) * np.sqrt(variance)
+    change[:, : frame.nx] = (math.sqrt(len(axes)) + FARTHER) * np.sqrt(variance)
     about[:, : frame.nx] = mean
-    series = expand(frame.noise, frame.values, about.ravel(), change.ravel())
-    return frame.noise._replace(near=series)
+    near = expand(frame.noise, frame.values, about.ravel(), change.ravel())
+    return problem._replace(frame=frame._replace(noise=frame.noise._replace(near=near)))

@@ -1,4 +1,6 @@
-"""Which pixels of a frame enter the likelihood, and the background polynomial in all of them."""
+"""Which pixels of a frame enter the likelihood, and what is expected in all of them."""
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +20,14 @@ OVERLAP = 12.0  # PSF widths beyond which sources have nothing to do with one an
 BYTES_A_PAIR = 200.0  # that overlaps, in the search for the maximum
 BRIGHT = 20.0  # standard deviations of a flux from which Laplace's approximation is enough
 BLOCK = 2**21  # pixels of a large frame that are looked at together
+
+
+class Expected(NamedTuple):
+    """Expected counts; NaN where a map folds."""
+
+    light: Floats  # (ny, nx) of the sources, counts per pixel
+    level: Floats  # (ny, nx) of the background
+    fluxes: Floats  # (s,) counts
 
 
 def usable_pixels(

@@ -50,8 +50,9 @@ class Posterior(FrameDensity):
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is to be used.
     nuisances : Nuisances
-    extrapolation : FluxExtrapolation, optional
-        Where free fluxes have their maximum near some parameters: `near` makes it.
+    extrapolation : FluxExtrapolation or Around, optional
+        Where free fluxes have their maximum near some parameters; or with fixed fluxes and a noise
+        that is slow to evaluate, these parameters: `near` makes it.
     valid : array_like of bool, shape (ny, nx), optional
         True where a pixel may be used when the footprint moves; by default `mask`.
     psf_errors : PsfErrors, optional
@@ -114,9 +115,7 @@ class Posterior(FrameDensity):
         if valid is None:
             valid = finite & (True if mask is None else mask)
         valid = used if np.array_equal(valid, used) else np.array(valid, dtype=bool)
-        if (
-            isinstance(extrapolation, FluxExtrapolation) and extrapolation.model is not model
-        ):
+        if isinstance(extrapolation, FluxExtrapolation) and extrapolation.model is not model:
             raise InputError(
                 "extrapolation: got that of another model, expected this one's: leave it out"
             )
@@ -129,6 +128,11 @@ class Posterior(FrameDensity):
         object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
         if psf_errors is not None:
             psf_errors.require_names(self.parameter_names)
+        if isinstance(extrapolation, Around) and extrapolation.params.size != self.n_parameters:
+            raise InputError(
+                f"extrapolation: got one about {extrapolation.params.size} parameters, expected "
+                f"{self.n_parameters}: leave it out"
+            )
 
     @cached_property
     def likelihood(self) -> FrameLikelihood:
@@ -206,11 +210,17 @@ class Posterior(FrameDensity):
         return self.likelihood.fisher(vector)
 
     def near(self, params: Floats, covariance: Floats) -> "Posterior":
-        """The same posterior, with a faster `log_prob` around `params` where fluxes are free.
+        """The same posterior, with a faster `log_prob` around `params`.
 
-        It extrapolates the most likely fluxes from those at `params`. Where that fails it looks for
-        them as usual; values differ by rounding and at most 5e-5, by some 1e-6 within a few
-        standard deviations.
+        Free fluxes: it extrapolates the most likely ones from those at `params`. Where that fails
+        it looks for them as usual; values differ by rounding and at most 5e-5, by some 1e-6 within
+        a few standard deviations.
+
+        Fixed fluxes with read noise or a flat field: it expands the log-likelihood of every pixel
+        in its expected counts. Where these leave the range of the expansion it evaluates the
+        formula as usual; values differ by less than 1e-4.
+
+        Otherwise, also with scattered positions or a model error, it is the posterior itself.
 
         Parameters
         ----------
@@ -230,7 +240,9 @@ class Posterior(FrameDensity):
         close = self.likelihood.near(self._vector(params), covariance)
         if close is self.likelihood:
             return self
-        return replace(self, extrapolation=close.extrapolation)
+        found = replace(self, extrapolation=close.extrapolation)
+        vars(found)["likelihood"] = close  # with what is made of the frame
+        return found
 
     def with_psf(self, psf: PSF) -> "Posterior":
         """The same posterior with another PSF, and without what errors of a PSF took from it.

@@ -35,8 +35,8 @@ from typing import Any
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.model.likelihood import Expected
 from bayesfred.model.noise import Noise
+from bayesfred.model.pixels import Expected
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.source_numbers import determined_numbers
 

@@ -5,6 +5,7 @@ differs too much from log p in between, the range is halved a few times. After t
 mean is not positive, the pixel is always out of range and its log p is evaluated.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ from bayesfred.model.kernels.contexts import LIMIT
 from bayesfred.model.kernels.mean_series import BLOCK, DEGREE, FIELDS, MeanSeries
 from bayesfred.model.kernels.noise_dispatch import log_density
 
-TOLERANCE = 1e-8  # of a pixel's log p, within its range
-LARGE = 1e6  # mean from which on rounding of log p counts, and the tolerance is proportional to it
+TOLERANCE = 5e-6  # of the sum, if the errors of pixels at the ends of their ranges are independent
+LARGE = 1e5  # mean from which on rounding counts, and the tolerance is proportional to it
 HALVINGS = 3  # of a range
 LEAST_RANGE = 1e-3  # in units of the photon noise: large against the rounding of float32
 MOST_RANGE = 0.5  # in units of the mean: log p is singular nowhere but at negative means
@@ -59,8 +60,9 @@ def _fit(known, i, block):
 
 
 @entry()
-def _expand(noise, values, mean, change, blocks, constants):
-    """The polynomials of all segments; `change` is by how much a mean may move."""
+def _expand(noise, values, means, tolerance, blocks, constants):
+    """The polynomials of all segments; means are (mean, change), see `expand`."""
+    mean, change = means
     known, centre, reach = np.empty((POINTS.size, SEGMENT)), np.ones(SEGMENT), np.ones(SEGMENT)
     left = np.zeros(SEGMENT, np.bool_)
     for s in range(constants.size):
@@ -83,8 +85,8 @@ def _expand(noise, values, mean, change, blocks, constants):
                 if halving == 0:
                     constants[s] += known[MIDDLE, i]
                 block[i] = centre[i]
-                tolerance = TOLERANCE * max(1.0, centre[i] / LARGE)
-                if centre[i] > 0.0 and _fit(known, i, block) <= tolerance:
+                allowed = tolerance * max(1.0, centre[i] / LARGE)
+                if centre[i] > 0.0 and _fit(known, i, block) <= allowed:
                     block[SEGMENT + i] = 1.0 / reach[i]
                     left[i] = False
                     some -= 1
@@ -115,5 +117,6 @@ def expand(noise: Any, values: Floats, mean: Floats, change: Floats) -> MeanSeri
     """
     segments = values.size // SEGMENT
     blocks, constants = np.zeros(segments * FIELDS * SEGMENT, np.float32), np.zeros(segments)
-    _expand(noise, values, mean, change, blocks, constants)
+    tolerance = TOLERANCE / math.sqrt(max(int(np.sum(values > LIMIT)), 1))
+    _expand(noise, values, (mean, change), tolerance, blocks, constants)
     return MeanSeries(blocks, constants)

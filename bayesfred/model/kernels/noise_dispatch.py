@@ -171,9 +171,9 @@ def _summed_near(noise, values, light, mean, place):
 
 
 summed = by_type(
-    lambda family: _summed_near
-    if hasattr(family, "near")
-    else getattr(family, "summed", _pixel_by_pixel)
+    lambda family: (
+        _summed_near if hasattr(family, "near") else getattr(family, "summed", _pixel_by_pixel)
+    )
 )
 spread = by_type(lambda family: family.spread)
 given = _optional("given", _same)

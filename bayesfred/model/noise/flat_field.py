@@ -154,7 +154,11 @@ class FlatFieldNoise(Noise):
         response[:, : self.response.shape[1]] = self.response
         counts = np.where(values > LIMIT, values * response, MASKED)
         return FlatFieldTerms(
-            self.noise.terms(counts), counts.ravel(), response.ravel(), no_series(), no_mean_series()
+            self.noise.terms(counts),
+            counts.ravel(),
+            response.ravel(),
+            no_series(),
+            no_mean_series(),
         )
 
     def with_unreached(self, terms: FlatFieldTerms, values: Floats) -> FlatFieldTerms:
