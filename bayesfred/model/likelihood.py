@@ -121,10 +121,10 @@ class FrameLikelihood:
 
     def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
         """The same likelihood, faster to evaluate around `params`: see `Posterior.near`."""
-        if not self.nuisances.profiled and hasattr(self._frame.noise, "near"):
-            return self._with(Around(params, covariance))
         if self.nuisances.profiled != 1:
-            return self
+            slow = not self.noise.discrete and hasattr(self._frame.noise, "near")
+            fixed = self.nuisances.profiled == 0
+            return self._with(Around(params, covariance)) if slow and fixed else self
         out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
             slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)

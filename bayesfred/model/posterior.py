@@ -51,8 +51,8 @@ class Posterior(FrameDensity):
         True where a pixel is to be used.
     nuisances : Nuisances
     extrapolation : FluxExtrapolation or Around, optional
-        Where free fluxes have their maximum near some parameters; or with fixed fluxes and a noise
-        that is slow to evaluate, these parameters: `near` makes it.
+        What `near` knows: where free fluxes have their maximum around some parameters; or with
+        fixed fluxes and read noise, these parameters.
     valid : array_like of bool, shape (ny, nx), optional
         True where a pixel may be used when the footprint moves; by default `mask`.
     psf_errors : PsfErrors, optional
@@ -216,9 +216,9 @@ class Posterior(FrameDensity):
         it looks for them as usual; values differ by rounding and at most 5e-5, by some 1e-6 within
         a few standard deviations.
 
-        Fixed fluxes with read noise or a flat field: it expands the log-likelihood of every pixel
-        in its expected counts. Where these leave the range of the expansion it evaluates the
-        formula as usual; values differ by less than 1e-4.
+        Fixed fluxes with read noise, also under a flat field: it expands the log-likelihood of
+        every pixel in its expected counts. Where these leave the range of the expansion it
+        evaluates the formula as usual; values differ by less than 1e-4.
 
         Otherwise, also with scattered positions or a model error, it is the posterior itself.
 
