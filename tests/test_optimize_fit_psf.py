@@ -313,9 +313,20 @@ def test_conventions_of_volume_and_centroid():
     sigma = math.hypot(estimate.params[posterior.parameter_names.index("psf_sigma")], 12**-0.5)
     window = np.exp(-0.5 * (x**2 + x[:, None] ** 2) / sigma**2)
     for axis in (x, x[:, None]):
-        # the convention is a sum over the coarse grid of the variation, and this over the fine one
         centroids = (psf.coefficients * window * axis).sum(axis=(1, 2)) * h * h
-        np.testing.assert_allclose(centroids, 0.0, atol=1e-3)
+        np.testing.assert_allclose(centroids, 0.0, atol=1e-9)
+
+
+def test_conventions_are_those_of_all_grids_combined():
+    """Grids of 1, 2 and 8 fine knots have them, so it does not matter which has what."""
+    grid = PsfGrid(4.0, 1.3, 1, 6.0, 4.0, wings=12.0)
+    c = np.random.default_rng(1).normal(size=grid.conventions.shape[1])
+    terms, h = grid.combined(c), 1.0 / grid.oversampling
+    x = (np.arange(terms.shape[1]) - 0.5 * (terms.shape[1] - 1)) * h
+    window = np.exp(-0.5 * (x**2 + x[:, None] ** 2) / grid.sigma**2)
+    rows = np.stack([np.ones_like(window), x * window, x[:, None] * window])
+    expected = np.tensordot(terms, rows, ((1, 2), (1, 2))) * h * h
+    np.testing.assert_allclose((grid.conventions @ c).reshape(3, 3), expected, rtol=1e-9)
 
 
 def test_the_psf_leaves_pixels_that_tell_the_background():

@@ -9,6 +9,7 @@ from scipy import linalg
 import bayesfred as bf
 from bayesfred.imaging.psf.spline_values import spline_coefficients
 from bayesfred.optimize import measure_psf as measuring
+from bayesfred.optimize.fit_psf import _measured_at_nodes, solved
 from bayesfred.optimize.psf_equations import observed
 from bayesfred.optimize.psf_marginal import lit_pixels
 from bayesfred.optimize.psf_nodes import NodeEquations
@@ -18,23 +19,25 @@ from bayesfred.optimize.psf_start import starting_grid, starting_state
 SIGMA, SIDE, NODES = 1.4, 285, 5
 
 
-def turning_psf(half):
+def turning_psf(half, number=NODES):
     """Ellipses that turn by 45 degrees from node to node: no polynomial of low degree."""
     x = np.arange(-32, 33) / 4.0
     a, b = x, x[:, None]
     round_one = np.exp(-(a**2 + b**2) / (2 * SIGMA**2)) / (2 * np.pi * SIGMA**2)
     terms = [round_one]
-    for row in range(NODES):
-        for column in range(NODES):
+    for row in range(number):
+        for column in range(number):
             angle = 0.25 * np.pi * (row + column)
             p, q = a * np.cos(angle) + b * np.sin(angle), b * np.cos(angle) - a * np.sin(angle)
             long, short = 1.25 * SIGMA, SIGMA / 1.25
             own = np.exp(-0.5 * (p / long) ** 2 - 0.5 * (q / short) ** 2) / (2 * np.pi * SIGMA**2)
             terms.append(own / own.sum() * round_one.sum() - round_one)
-    return bf.MeasuredPSF(np.array([spline_coefficients(t) for t in terms]), 4.0, half, nodes=NODES)
+    return bf.MeasuredPSF(
+        np.array([spline_coefficients(t) for t in terms]), 4.0, half, nodes=number
+    )
 
 
-def frame_of(seed, side=SIDE, grid=20, flux=3e4):
+def frame_of(seed, side=SIDE, grid=20, flux=3e4, number=NODES):
     """A posterior that takes the PSF for a Gaussian, and the true parameters."""
     terms = [(1, 0, 0, 0), (0, 1, 0, 0), (2, 0, 0, 0), (1, 1, 0, 0), (0, 2, 0, 0)]
     distortion = bf.PolynomialDistortion(terms, terms)
@@ -42,7 +45,7 @@ def frame_of(seed, side=SIDE, grid=20, flux=3e4):
     stars = bf.SourceCatalog.grid(grid, 13.6, flux)  # every phase of the pixels
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=10) * np.repeat([[2e-3] * 2 + [1e-5] * 3], 2, axis=0).ravel()
-    true = bf.ForwardModel(detector, stars, turning_psf(0.5 * side), distortion)
+    true = bf.ForwardModel(detector, stars, turning_psf(0.5 * side, number), distortion)
     counts = bf.simulate(true, theta, 20.0, seed=seed)
     taken = bf.ForwardModel(
         bf.Detector((side, side), pixel="box"), stars, bf.GaussianPSF(SIGMA), distortion
@@ -145,6 +148,21 @@ def test_splines_are_the_derivatives_of_the_light():
     expected *= np.sqrt(observed(posterior, state, data, error).weight)
     expected = expected[np.abs(expected) > 0.0]
     assert abs(np.sort(light[light != 0.0]) - np.sort(expected)).max() < 1e-8 * np.abs(light).max()
+
+
+def test_it_does_not_matter_where_the_first_psf_stopped():
+    """Another PSF that does not vary and another background lead to the same places.
+
+    Without a step of their own these stayed: the background 19 standard deviations apart.
+    """
+    posterior, _ = frame_of(6, side=125, grid=8, flux=3e5, number=2)
+    estimate = bf.find_map(posterior)
+    first = began(posterior, estimate)
+    known = solved(posterior, replace(first, nodes=None)).state.with_nodes(2)
+    level = posterior.parameter_names.index("background")
+    first.params[level] *= 1.2
+    a, b = (_measured_at_nodes(posterior, state)[1].params for state in (first, known))
+    assert np.all(np.abs(a - b) < np.sqrt(np.diag(estimate.covariance)))
 
 
 def measured(seed, **variation):

@@ -35,7 +35,7 @@ from bayesfred.optimize.psf_equations import (
     field_radius,
 )
 from bayesfred.optimize.psf_levels import STRENGTH
-from bayesfred.optimize.psf_nodes import NodeEquations
+from bayesfred.optimize.psf_nodes import NEAR, PRECISE, NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
 from bayesfred.optimize.psf_start import reach, starting_grid, starting_state, suited_grid
 
@@ -43,6 +43,7 @@ TURNS = 40
 LITTLE = 0.3  # standard deviations by which a parameter may be off
 SETTLED = 0.95  # of the model error before
 CHOOSING = 8  # turns of the strengths of the prior within one
+ROUGH = 100.0  # squared standard deviations of an unknown, of a state to begin from
 EXACT = 4  # turns in which the model is taken to be exact, at the most
 PATIENCE = 6  # turns without a nearer place after which an information leads no more
 FARTHER = 10.0  # than the nearest place: there it leads no more at all
@@ -191,7 +192,7 @@ def solved(
     exact : bool
         Take the model to be exact in the first turns.
     rough : bool
-        Be content with a state that is, on average, a standard deviation away.
+        Be content with a state from which a PSF that varies can be found.
 
     Returns
     -------
@@ -208,7 +209,7 @@ def solved(
         # strengths that are iterated until they rest are the same whatever the start
         equations = equations.with_strengths(CHOOSING if close else 1)
         far = _far(equations)
-        close = far < equations.pull.size
+        close = far < (ROUGH if rough else 1.0) * equations.pull.size
         if not exact and (far < STILL or (close and rough)):
             return equations
         if close and not exact:
@@ -336,23 +337,19 @@ def _measured(
 def _measured_at_nodes(
     posterior: Posterior, state: PsfState
 ) -> tuple[MeasuredPSF, PsfState, Floats]:
-    """The PSF that varies between nodes, its state, and no draws: the nodes' errors are theirs."""
-    nodes, error = state.nodes, math.inf
-    assert nodes is not None, "the PSF varies between them"
-    for _ in range(TURNS):
-        equations = NodeEquations.of(posterior, state)
-        nodes, change, far = equations.solved(nodes)
-        error, before = equations.model_error, error
-        if far < LITTLE and error >= SETTLED * before:
-            break
-        every = np.concatenate([np.zeros_like(state.deviations), change])
-        state = _moved(posterior, replace(state, nodes=nodes), every)
-    else:
-        raise InputError(
-            f"psf: no PSF found in {TURNS} turns between {nodes.number} x {nodes.number} nodes: "
-            "expected sources at most of them: set fewer nodes"
-        )
-    state = replace(state, nodes=nodes)
+    """The PSF that varies between nodes, its state, and no draws: the nodes' errors are theirs.
+
+    What does not vary, and the background, take a step of their own: where the search began they
+    stand for what varies, too.
+    """
+    assert state.nodes is not None, "the PSF varies between them"
+    if not state.nodes.coefficients.any():
+        state = _at_nodes(posterior, state, NEAR)[0]
+    shared = PsfEquations.of(posterior, state).with_strengths(1)
+    state = _moved(posterior, shared.state, _change(shared))
+    state, equations = _at_nodes(posterior, state, PRECISE)
+    nodes = state.nodes
+    assert nodes is not None, "it has as many as before"
     every = state.grid.combined(state.coefficients, nodes.coefficients)
     common = np.tensordot(equations.share, every[1:], 1)
     every[0] += common
@@ -364,7 +361,29 @@ def _measured_at_nodes(
         field_radius(posterior, nodes.number),
         nodes=nodes.number,
         draws=(every[0] + drawn)[:, None],
-        model_error=error,
+        model_error=equations.model_error,
         determined=nodes.determined,
     )
     return psf, state, np.zeros((0, state.deviations.size))
+
+
+def _at_nodes(
+    posterior: Posterior, state: PsfState, precise: float
+) -> tuple[PsfState, NodeEquations]:
+    """The state where the nodes are found, as precisely as this, and the equations there."""
+    nodes, error, now = state.nodes, math.inf, NEAR
+    assert nodes is not None, "the PSF varies between them"
+    for _ in range(TURNS):
+        equations = NodeEquations.of(posterior, state)
+        nodes, change, far = equations.solved(nodes, now)
+        error, before = equations.model_error, error
+        if far < LITTLE and error >= SETTLED * before:
+            if now <= precise:
+                return replace(state, nodes=nodes), equations
+            now = precise
+        every = np.concatenate([np.zeros_like(state.deviations), change])
+        state = _moved(posterior, replace(state, nodes=nodes), every)
+    raise InputError(
+        f"psf: no PSF found in {TURNS} turns between {nodes.number} x {nodes.number} nodes: "
+        "expected sources at most of them: set fewer nodes"
+    )

@@ -133,7 +133,7 @@ class PsfInformation:
             (state.fluxes, weight, data.background), pixels.templates,
         )  # fmt: skip
         own, with_background = template_products(data, pixels.templates, weight, len(state.fluxes))
-        columns, select = _acting(posterior, state)
+        columns, select = acting_columns(posterior, state)
         mixed = columns.T @ (with_background @ select)
         inner = columns.T @ (own @ columns) + mixed + mixed.T
         inner += select.T @ (data.background.T @ (weight[:, None] * data.background)) @ select
@@ -202,7 +202,7 @@ class PsfEquations:
         information = known.information if known else PsfInformation.of(posterior, state, pixels)
         psf = psf_slope(state.grid.unknown, pixels.terms, data.samples, state.fluxes, score)
         own = template_pulls(data, pixels.templates, score, len(state.fluxes))
-        columns, select = _acting(posterior, state)
+        columns, select = acting_columns(posterior, state)
         inner = columns.T @ own + select.T @ (data.background.T @ score)
         given = zip(posterior.prior.values(), state.params, strict=True)
         inner += [priors.slope(prior, x)[0] for prior, x in given]
@@ -369,8 +369,11 @@ def observed(
     return Pixels(data, terms, templates, weight, weight * residual, error)
 
 
-def _acting(posterior: Posterior, state: PsfState) -> tuple[Floats, Floats]:
-    """How the parameters act on the templates, and which are the background's terms."""
+def acting_columns(posterior: Posterior, state: PsfState) -> tuple[Floats, Floats]:
+    """How the parameters act on the templates, and on which the background's terms do.
+
+    Shapes are (3 s, d) and (terms, d).
+    """
     levels = [k for k, p in enumerate(posterior.parameters) if p.kind == "background"]
     columns = source_columns(posterior, state.params, state.fluxes)
     return columns, np.eye(posterior.n_parameters)[levels]

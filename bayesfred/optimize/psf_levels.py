@@ -158,17 +158,21 @@ class PsfGrid:
     def conventions(self) -> Floats:
         """Volume and centroid of every term of the field, shape (3 terms, coefficients).
 
-        The centroid is that within a Gaussian of the start's width.
+        The centroid is that within a Gaussian of the start's width. It is that of the fine grid's
+        coefficients, which coarser ones are combined to: so it does not matter which grid has what
+        several could have.
         """
         levels = self.levels
         last = levels.side.size - 1
         size = levels.start[last] + levels.side[last] ** 2 * (levels.high[last] - levels.low[last])
         out = np.zeros((3 * len(field_powers(self.degree)), int(size)))
         for k, side in enumerate(levels.side):
-            h, n = float(levels.spacing[k]), int(side)
-            x = (np.arange(n) - 0.5 * (n - 1)) * h
+            finer = self._finer(k)
+            m, n, h = len(finer), int(side), 1.0 / self.oversampling
+            x = (np.arange(m) - 0.5 * (m - 1)) * h
             weight = np.exp(-0.5 * (x**2 + x[:, None] ** 2) / self.sigma**2)
-            rows = np.stack([np.ones((n, n)), x * weight, x[:, None] * weight])
+            rows = np.stack([np.ones((m, m)), x * weight, x[:, None] * weight])
+            rows = finer.T @ rows @ finer
             terms = int(levels.high[k] - levels.low[k])
             for t in range(terms):
                 begin, term = int(levels.start[k]) + t, int(levels.low[k]) + t
@@ -185,6 +189,13 @@ class PsfGrid:
         rows = one.conventions[3 : 3 * first, one.fixed :][:, block.where]
         return side, block, rows
 
+    def _finer(self, k: int) -> Floats:
+        """What makes coefficients along an axis of a grid those of the fine one's spacing."""
+        out = np.eye(int(self.levels.side[k]))
+        for _ in range(round(self.levels.spacing[k] * self.oversampling).bit_length() - 1):
+            out = halved(len(out)) @ out
+        return out
+
     def combined(self, coefficients: Floats, nodes: Floats | None = None) -> Floats:
         """All grids' coefficients as those of one fine grid, shape (terms, n, n).
 
@@ -195,10 +206,8 @@ class PsfGrid:
             terms = int(levels.high[k] - levels.low[k])
             begin = int(levels.start[k])
             part = coefficients[begin : begin + terms * side**2].reshape(side, side, terms)
-            part = np.moveaxis(part, 2, 0)
-            for _ in range(round(levels.spacing[k] * self.oversampling).bit_length() - 1):
-                finer = halved(part.shape[1])
-                part = finer @ part @ finer.T
+            finer = self._finer(k)
+            part = finer @ np.moveaxis(part, 2, 0) @ finer.T
             parts.append((int(levels.low[k]), part))
         terms = len(field_powers(self.degree))
         if nodes is not None:

@@ -32,18 +32,20 @@ from bayesfred.errors import InputError
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.psf_equations import (
     PsfState,
+    acting_columns,
     free_templates,
     node_weights,
     observed,
     shift_precision,
 )
 from bayesfred.optimize.psf_levels import LIMITS, PsfNodes
-from bayesfred.optimize.psf_samples import OUTLYING, PsfSamples, source_columns
+from bayesfred.optimize.psf_samples import OUTLYING, PsfSamples
 
 SUPPORT = 4  # B-splines that are not zero at a point of an axis
 CHOICES = 10  # of the strength, at the most
 SETTLED = 0.1  # change of its logarithm
-PRECISE = 1e-3  # of a solution: far less than its standard deviations
+NEAR = 1e-3  # of a solution that others will follow
+PRECISE = 1e-4  # of the last one: the whole is thousands of standard deviations long
 ROUGH = 0.05  # where its product with the slope is wanted, which is off by the square
 STEPS = 2000  # of conjugate gradients
 TINY = 1e-9  # of its information that is added to what a source says of itself
@@ -59,12 +61,12 @@ class NodeEquations:
         Of the model without the nodes, in standard deviations.
     splines : sparse array, shape (pixels, s knots)
         Derivatives of the pixels by the coefficients of every source.
-    templates : sparse array, shape (pixels, 3 s)
-        By the flux and the shifts of every source.
-    parameters : ndarray, shape (3 s, d)
-        How the parameters that act on all sources act on the templates.
-    eliminated : sparse array, shape (3 s, 3 s + d)
-        How what is eliminated acts on the templates: the flux and the shifts of every source, and
+    templates : sparse array, shape (pixels, 3 s + terms)
+        By the flux and the shifts of every source, and by the background's terms.
+    parameters : ndarray, shape (3 s + terms, d)
+        How the parameters act on these.
+    eliminated : sparse array, shape (3 s + terms, 3 s + d)
+        How what is eliminated acts on these: the flux and the shifts of every source, and
         the parameters; the pixels' derivatives by it have unit length, or are 0 where it is known.
     lengths : ndarray, shape (3 s + d,)
         That these had.
@@ -109,18 +111,21 @@ class NodeEquations:
         light = state.fluxes[source] * data.samples.size * root[data.owner]
         knots = np.stack([data.samples.a, data.samples.b]) * (0.5 * state.grid.oversampling)
         inside = np.abs(knots).max(axis=0) < 0.5 * (side + 3)
-        rows, owner = np.unique(data.owner[inside], return_inverse=True)
-        source, shape = source[inside], (rows.size, sources)
-        splines = _splines(knots[:, inside], side, light[inside], source, owner, shape)
-        own = pixels.templates[:, inside] * root[rows[owner]]
-        ends = np.searchsorted(owner, np.arange(rows.size + 1))
+        shape = data.pixel.size, sources
+        splines = _splines(
+            knots[:, inside], side, light[inside], source[inside], data.owner[inside], shape
+        )
+        own = pixels.templates * root[data.owner]
         columns = 3 * source[:, None] + np.arange(3)
         templates = sparse.csr_array(
-            (own.T.ravel(), columns.ravel(), 3 * ends), (rows.size, 3 * sources)
+            (own.T.ravel(), columns.ravel(), 3 * data.samples.first), (shape[0], 3 * sources)
         )
-        parameters = source_columns(posterior, state.params, state.fluxes)
+        templates = sparse.hstack([templates, root[:, None] * data.background]).tocsr()
+        parameters = np.concatenate(acting_columns(posterior, state))
         free = free_templates(posterior, state, pixels).ravel()
-        eliminated = sparse.hstack([sparse.diags_array(1.0 * free), parameters]).tocsr()
+        own_shape = templates.shape[1], free.size
+        free = sparse.diags_array(1.0 * free, shape=own_shape)
+        eliminated = sparse.hstack([free, parameters]).tocsr()
         gram = templates.T @ templates
         squares = eliminated.multiply(gram @ eliminated).sum(axis=0)
         lengths = np.sqrt(np.asarray(squares, dtype=np.float64).ravel())
@@ -130,7 +135,7 @@ class NodeEquations:
         precision, known = shift_precision(posterior, state), np.zeros((2, lengths.size))
         known[:, : precision.size] = precision, precision * values
         weights = node_weights(posterior, state.nodes.number)
-        residual = (pixels.score / root)[rows] + splines @ state.nodes.splines(weights).ravel()
+        residual = pixels.score / root + splines @ state.nodes.splines(weights).ravel()
         return cls(
             residual, splines, templates, parameters, eliminated, lengths, known, weights,
             prior.roughness.toarray() + np.diag(prior.amplitude), conventions, pixels.model_error,
@@ -240,12 +245,14 @@ class NodeEquations:
             )
         return coefficients(found)
 
-    def solved(self, before: PsfNodes) -> tuple[PsfNodes, Floats, float]:
+    def solved(self, before: PsfNodes, precise: float = PRECISE) -> tuple[PsfNodes, Floats, float]:
         """The nodes, with the strength of their prior that the evidence prefers.
 
         Parameters
         ----------
         before : PsfNodes
+        precise : float
+            How far the solution may be off, of its length.
 
         Returns
         -------
@@ -258,7 +265,7 @@ class NodeEquations:
         pull, strength = self.pull, before.strength
         found = before.coefficients.reshape(-1, self.knots)
         for _ in range(CHOICES):
-            found = self.solution(strength, pull, found)
+            found = self.solution(strength, pull, found, precise)
             known = self.information()
             determined = float(np.sum(known / (strength + known)))
             square = float(np.sum(found * (found @ self.precision)))
