@@ -23,7 +23,7 @@ from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.threads import one_thread
 
-PIXEL = 24  # bytes that a worker needs for a pixel of a frame: counts, twice, and masks
+PIXEL = 48  # bytes that a worker needs for a pixel of a frame: counts, twice, masks, and `near`
 
 Source = Posterior | Callable[[], Posterior]
 Lack = Literal["frame", "around"]
