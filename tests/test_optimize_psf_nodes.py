@@ -88,6 +88,28 @@ def test_equations_agree_with_dense_ones():
     assert np.abs(equations.conventions @ found.T).max() < 1e-12 * np.abs(found).max()
 
 
+def test_slopes_vary_as_the_nodes_do():
+    """Of the background, too; against the dense posterior of the nodes."""
+    posterior, _ = frame_of(3, side=61, grid=4)
+    state = began(posterior, bf.find_map(posterior))
+    equations = NodeEquations.of(posterior, state, 0.02)
+    design, strength = dense(equations), 7.0
+    own = (equations.templates @ equations.eliminated).toarray()
+    apart = design - own @ linalg.lstsq(own, design)[0]
+    nodes = equations.weights.shape[1]
+    free = np.kron(np.eye(nodes), linalg.null_space(equations.conventions))
+    matrix = apart.T @ apart + np.kron(np.eye(nodes), strength * equations.precision)
+    by = free.T @ design.T @ (equations.templates @ equations.parameters)
+    expected = by.T @ np.linalg.solve(free.T @ matrix @ free, by)
+    found = equations.covariance_of_slopes(strength)
+    sd = np.sqrt(np.diag(expected))
+    unit = np.outer(*[np.where(sd > 0.0, sd, 1.0)] * 2)
+    np.testing.assert_allclose(
+        found / unit, expected / unit, atol=0.02
+    )  # 5 % of a solution, squared
+    assert sd[posterior.parameter_names.index("background")] > 0.0
+
+
 def test_shifts_of_single_sources_are_pulled_to_their_prior():
     """Against the joint solution of nodes, parameters, fluxes and shifts."""
     posterior, _ = frame_of(5, side=61, grid=4)
@@ -157,11 +179,11 @@ def test_it_does_not_matter_where_the_first_psf_stopped():
     """
     posterior, _ = frame_of(6, side=125, grid=8, flux=3e5, number=2)
     estimate = bf.find_map(posterior)
-    first = began(posterior, estimate)
+    first, brighter = began(posterior, estimate), estimate.params.copy()
     known = solved(posterior, replace(first, nodes=None)).state.with_nodes(2)
-    level = posterior.parameter_names.index("background")
-    first.params[level] *= 1.2
-    a, b = (_measured_at_nodes(posterior, state)[1].params for state in (first, known))
+    brighter[posterior.parameter_names.index("background")] *= 1.2
+    starts = replace(first, params=brighter), known
+    a, b = (_measured_at_nodes(posterior, state)[1].params for state in starts)
     assert np.all(np.abs(a - b) < np.sqrt(np.diag(estimate.covariance)))
 
 
