@@ -10,7 +10,7 @@ import bayesfred as bf
 from bayesfred.imaging.psf.spline_values import spline_coefficients
 from bayesfred.optimize import measure_psf as measuring
 from bayesfred.optimize.fit_psf import _measured_at_nodes, solved
-from bayesfred.optimize.psf_equations import observed
+from bayesfred.optimize.psf_equations import PsfEquations, observed
 from bayesfred.optimize.psf_marginal import lit_pixels
 from bayesfred.optimize.psf_nodes import NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
@@ -185,6 +185,33 @@ def test_it_does_not_matter_where_the_first_psf_stopped():
     starts = replace(first, params=brighter), known
     a, b = (_measured_at_nodes(posterior, state)[1].params for state in starts)
     assert np.all(np.abs(a - b) < np.sqrt(np.diag(estimate.covariance)))
+
+
+def bright_frame():
+    """A frame whose nodes are known to be thousands of standard deviations from zero."""
+    posterior, _ = frame_of(6, side=125, grid=8, flux=3e7, number=2)
+    estimate = bf.find_map(posterior)
+    return posterior, estimate, began(posterior, estimate)
+
+
+def test_what_does_not_vary_is_where_its_own_equations_lead():
+    """Within a standard deviation, on average. From the start alone it is 2.4 away."""
+    posterior, _, start = bright_frame()
+    state = _measured_at_nodes(posterior, start)[1]
+    equations = PsfEquations.of(posterior, state)
+    assert equations.measured @ equations.measured < equations.pull.size
+
+
+def test_solutions_are_precise():
+    """To a fraction of the parameters' errors; ten times less precise ones are 0.3 away."""
+    posterior, estimate, start = bright_frame()
+    equations = NodeEquations.of(posterior, start)
+    found, exact = (
+        equations.solved(start.nodes, *precise)[1][: posterior.n_parameters]
+        for precise in ((), (1e-9,))
+    )
+    sd = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(found - exact) <= 0.2 * sd)
 
 
 def measured(seed, **variation):
