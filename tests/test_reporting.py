@@ -788,6 +788,17 @@ def test_star_panels_show_the_brightest_inside_the_frame() -> None:
     pixels(figure)
 
 
+def test_masked_sources_are_the_last_among_the_brightest() -> None:
+    expected = np.ones((40, 60))
+    expected[10, 20], expected[30, 40] = 100.0, 50.0
+    u, v = np.array([20, 40]) - 29.5, np.array([10, 30]) - 19.5
+    mask = np.ones(expected.shape, bool)
+    mask[5:16, 15:26] = False
+    frame = FittedFrame(expected, expected, expected**0.5, mask)
+    places = [text for text in texts_of(star_panels(frame, u, v, half_width=3)) if "," in text]
+    assert places == ["+10, +10", "−10, −10"]
+
+
 def test_star_panels_show_at_most_24_and_survive_none() -> None:
     ones = np.ones((50, 50))
     frame = FittedFrame(ones, ones, ones, ones > 0)

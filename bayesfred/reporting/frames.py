@@ -117,8 +117,8 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
     ----------
     fitted : FittedFrame
     u, v : ndarray, shape (n_sources,), pixel
-        Positions from the middle of the frame; at most the 24 brightest that lie in the frame are
-        shown.
+        Positions from the middle of the frame; at most the 24 that lie in the frame and have the
+        most light in pixels of the likelihood are shown.
     half_width : int
         A stamp has 2 half_width + 1 pixels a side.
 
@@ -134,7 +134,8 @@ def star_panels(fitted: FittedFrame, u: Floats, v: Floats, *, half_width: int) -
     )
     inside = np.flatnonzero((column >= 0) & (column < nx) & (row_of >= 0) & (row_of < ny))
     stamp = partial(_stamp, half_width=half_width)
-    light = [float(np.nansum(stamp(fitted.expected, column[s], row_of[s]))) for s in inside]
+    used = np.where(fitted.mask, fitted.expected, 0.0)
+    light = [float(np.nansum(stamp(used, column[s], row_of[s]))) for s in inside]
     shown = inside[np.argsort(light, kind="stable")[::-1][:MAX_STARS]]
     blocks = 1 if shown.size < 3 else 3
     rows = max(-(-shown.size // blocks), 1)

@@ -79,7 +79,7 @@ def _draw_phase(sheet: Sheet, box: Box, phases: tuple[PixelPhase, PixelPhase]) -
     else:
         means = [_by_phase(fit) for fit in phases]
         grid = np.linspace(-0.5, 0.5, 201)
-        curves = [harmonics(grid) @ fit.coefficients for fit in phases if fit.dof]
+        curves = [1e3 * harmonics(grid) @ fit.coefficients for fit in phases if fit.dof]
         values = np.concatenate(
             [ends for _, mean, sd in means for ends in (mean - sd, mean + sd)] + curves
         )
@@ -95,20 +95,21 @@ def _draw_phase(sheet: Sheet, box: Box, phases: tuple[PixelPhase, PixelPhase]) -
             x, y = panel.at(place + offset, mean).T
             sheet.axes.plot(x, y, mark, color=colour, markersize=5)
             if fit.dof:
-                panel.line(grid, harmonics(grid) @ fit.coefficients, colors=colour, linewidths=1.2)
+                curve = 1e3 * harmonics(grid) @ fit.coefficients
+                panel.line(grid, curve, colors=colour, linewidths=1.2)
             x, y = _name(panel, (2.3, k), f"{name} along its axis", look)
             sheet.axes.plot(x + 0.15, y, mark, color=colour, markersize=5)
-    _around(panel, "position within the pixel", "displacement / pixel", "Pixel phase")
+    _around(panel, "position within the pixel", "displacement / 0.001 pixel", "Pixel phase")
 
 
 def _by_phase(fit: PixelPhase) -> tuple[Floats, Floats, Floats]:
-    """Bins of the phase that have sources: their middle, the mean displacement and its sd."""
+    """Bins of the phase that have sources: their middle, mean displacement and sd, 0.001 pixel."""
     bins = np.clip(((fit.phase + 0.5) * PHASE_BINS).astype(int), 0, PHASE_BINS - 1)
     weight = np.bincount(bins, fit.sd**-2.0, PHASE_BINS)
     mean = np.bincount(bins, fit.displacement * fit.sd**-2.0, PHASE_BINS)
     some = weight > 0.0
     place = (np.arange(PHASE_BINS)[some] + 0.5) / PHASE_BINS - 0.5
-    return place, mean[some] / weight[some], 1.0 / np.sqrt(weight[some])
+    return place, 1e3 * mean[some] / weight[some], 1e3 / np.sqrt(weight[some])
 
 
 def _draw_sources(sheet: Sheet, box: Box, residuals: Residuals, shape: tuple[int, int]) -> None:

@@ -286,7 +286,7 @@ def _row(values: dict[str, Any], parameter: Parameter, levels: Floats) -> dict[s
     """
     scale = scale_of(values["mean"], values["sd"])
     cells: dict[str, str] = {
-        key: _minus(scale.number(values[key]))
+        key: _minus(scale.number(values[key])) if math.isfinite(values[key]) else ""
         for key in ("truth", "MAP", "mean", "sd", "robust_sd")
         if key in values
     }
