@@ -302,6 +302,52 @@ def solve(lower, group, x):
             x[m] -= lower[at + m] * x[i]
 
 
+@leaf(fastmath=REDUCE)
+def _times_row(row, factor, x, out):
+    """Add factor times a row to out, and return the row's product with x."""
+    total = 0.0
+    for i in range(row.size):
+        total += row[i] * x[i]
+        out[i] += factor * row[i]
+    return total
+
+
+@shared()
+def invert(lower, group):
+    """(L L^T)^-1 where L has elements, stored as L is; those elsewhere are not needed for these.
+
+    References
+    ----------
+    K. Takahashi, J. Fagan & M.-S. Chin, 8th PICA Conference (1973): Q L is the upper triangle
+    L^-T, whose diagonal is known, and tells the columns of Q from the last to the first.
+    """
+    lead, start, size = group.lead, group.start, group.lead.size
+    out, ends = np.empty(lower.size), np.zeros(size, np.int64)
+    for i in range(size):
+        ends[lead[i]] = i + 1  # of a column, where only earlier ones end later, too
+    column, found = np.zeros(size), np.zeros(size)
+    for j in range(1, size):
+        ends[j] = max(ends[j], ends[j - 1])
+    for j in range(size - 1, -1, -1):
+        found[j + 1 : ends[j]] = 0.0
+        for i in range(j + 1, ends[j]):
+            column[i] = lower[start[i] + j] if lead[i] <= j else 0.0
+        for i in range(j + 1, ends[j]):
+            if lead[i] <= j:
+                at, within = start[i], slice(j + 1, i)
+                row = out[at + j + 1 : at + i]
+                own = _times_row(row, column[i], column[within], found[within])
+                found[i] += own + out[at + i] * column[i]
+        pivot = 1.0 / lower[start[j] + j]
+        own = pivot
+        for i in range(j + 1, ends[j]):
+            if lead[i] <= j:
+                out[start[i] + j] = -found[i] * pivot
+                own += found[i] * pivot * column[i]
+        out[start[j] + j] = own * pivot
+    return out
+
+
 @leaf()
 def add_template(fp, rows, template, amplitude, canvas):
     """Add amplitude times rows of one of a source's templates, shape (samples,), to a canvas."""

@@ -17,6 +17,7 @@ from bayesfred.model.kernels.clusters import (
     cholesky,
     dot,
     gram,
+    invert,
     one_cluster,
     shift_prior,
     solve,
@@ -128,15 +129,15 @@ def _add_cross(w, band, profiled, cross):
 def _known_scatter(h, group, profiled, templates, scatter):
     """Information about position_scatter from a cluster's sources."""
     share = DOF / (DOF + 4.0)
-    known, column = 0.0, np.empty(group.lead.size)
-    for i in range(column.size):
-        if i % templates > 0:
-            column[:] = 0.0
-            column[i] = 1.0
-            solve(h, group, column)
-            shift = profiled.shifts[group.members[i // templates]]
-            left = 1.0 - EXPECTED * shift_prior(shift, scatter)[1] * column[i]
-            known += share * 2.0 * (left / scatter) ** 2
+    known = 0.0
+    if templates > 1:
+        q = invert(h, group)
+        for i in range(group.lead.size):
+            if i % templates > 0:
+                shift = profiled.shifts[group.members[i // templates]]
+                own = q[group.start[i] + i]
+                left = 1.0 - EXPECTED * shift_prior(shift, scatter)[1] * own
+                known += share * 2.0 * (left / scatter) ** 2
     return known
 
 

@@ -56,6 +56,7 @@ from bayesfred.model.kernels.clusters import (
     bend_prior,
     cholesky,
     gram,
+    invert,
     one_cluster,
     shift_prior,
     solve,
@@ -133,21 +134,20 @@ def _add_mixed(touching, s, t, column, out):
 def _mix(adjoint, group, lower):
     """Add a cluster's q = Q T to `mixed`; returns the diagonal of Q."""
     boxes, members, mixed = adjoint.touching.boxes, group.members, adjoint.mixed
-    lead, touching, size = group.lead, adjoint.touching, mixed.shape[0]
-    diagonal, column = np.empty(lead.size), np.empty(lead.size)
+    lead, start, touching, size = group.lead, group.start, adjoint.touching, mixed.shape[0]
+    q, column, diagonal = invert(lower, group), np.empty(size), np.empty(lead.size)
     for i in range(lead.size):
         s = members[i // size]
-        column[:] = 0.0
-        column[i] = 1.0
-        solve(lower, group, column)
-        diagonal[i] = column[i]
+        diagonal[i] = q[start[i] + i]
         for m in range(lead[i] // size, members.size):
             t = members[m]
             if boxes[t, 0] >= boxes[s, 1]:
                 break
             if touch(boxes, s, t):
-                own = column[m * size : (m + 1) * size]
-                _add_mixed(touching, s, t, own, mixed[i % size])
+                for b in range(size):
+                    k = m * size + b
+                    column[b] = q[start[max(i, k)] + min(i, k)]
+                _add_mixed(touching, s, t, column, mixed[i % size])
     return diagonal
 
 
