@@ -46,7 +46,7 @@ CHOICES = 10  # of the strength, at the most
 SETTLED = 0.1  # change of its logarithm
 NEAR = 1e-3  # of a solution that others will follow
 PRECISE = 1e-4  # of the last one: the whole is thousands of standard deviations long
-ROUGH = 0.05  # where its product with the slope is wanted, which is off by the square
+ROUGH = 0.01  # where its product with the slope is wanted, which is off by the square
 STEPS = 2000  # of conjugate gradients
 TINY = 1e-9  # of its information that is added to what a source says of itself
 
@@ -147,10 +147,15 @@ class NodeEquations:
         return len(self.precision)
 
     @cached_property
-    def _own(self) -> SuperLU:
+    def _known(self) -> sparse.csc_array:
+        """The information about what is eliminated."""
         own = self.eliminated.T @ (self.templates.T @ self.templates) @ self.eliminated
         known = self.known[0] / self.lengths**2 + TINY
-        return splu((own + sparse.diags_array(known)).tocsc())
+        return (own + sparse.diags_array(known)).tocsc()
+
+    @cached_property
+    def _own(self) -> SuperLU:
+        return splu(self._known)
 
     def _explained(self, values: Floats, tied: Floats | float = 0.0) -> Floats:
         """The change of what is eliminated that explains values, in columns of unit length.
@@ -318,12 +323,15 @@ class NodeEquations:
         -------
         ndarray, shape (d, d)
         """
-        pulls = [self._pull(image) for image in (self.templates @ self.parameters).T]
+        # fluxes and shifts of single sources follow the parameters, too
+        images, size = self.templates @ self.parameters, self.parameters.shape[1]
+        single = self.templates @ self.eliminated[:, :-size]
+        images -= single @ splu(self._known[:-size, :-size]).solve(single.T @ images)
+        pulls = [self._pull(image) for image in images.T]
         none = np.zeros_like(pulls[0])
         moved = [
             self.solution(strength, pull, none, ROUGH) if pull.any() else none for pull in pulls
         ]
-        size = len(pulls)
         out = np.reshape(pulls, (size, -1)) @ np.reshape(moved, (size, -1)).T
         return np.asarray(0.5 * (out + out.T))
 
