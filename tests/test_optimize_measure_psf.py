@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import bayesfred as bf
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.optimize import measure_psf as measuring
 from bayesfred.optimize.measure_psf import psf_message
 from bayesfred.optimize.psf_samples import likely_error
@@ -97,3 +98,56 @@ def test_a_psf_that_leaves_much_should_vary_more():
         params = np.array([{**known, "model_error": error}[n] for n in posterior.parameter_names])
         estimate = bf.find_map(posterior, params)
         assert psf_message(posterior, replace(estimate, params=params)).endswith(said)
+
+
+SCATTER = 0.004
+
+
+def undersampled(seed: int) -> tuple[bf.Posterior, np.ndarray]:
+    """144 stars of a FWHM of 1.2 pixels that lie off the catalogue, the PSF taken for a Gaussian.
+
+    And the true coefficients.
+    """
+    rng = np.random.default_rng(seed)
+    terms = [(1, 0, 0, 0), (0, 1, 0, 0), (2, 0, 0, 0), (1, 1, 0, 0), (0, 2, 0, 0)]
+    lens, grid = bf.PolynomialDistortion(terms, terms), bf.SourceCatalog.grid(12, 13.6, 1e5)
+    x, y = np.stack([grid.x, grid.y]) + rng.uniform(-0.5, 0.5, (2, len(grid)))
+    theta = np.tile([2e-3, 2e-3, 1e-5, 1e-5, 1e-5], 2) * rng.normal(size=10)
+    off = SCATTER * np.sqrt(DOF / rng.chisquare(DOF, len(grid))) * rng.normal(size=(2, len(grid)))
+    detector = bf.Detector((185, 185), pixel="box")
+    there = replace(grid, x=x + off[0], y=y + off[1])
+    true = bf.ForwardModel(detector, there, bf.MoffatPSF(0.6, 2.5), lens)
+    taken = bf.ForwardModel(detector, replace(grid, x=x, y=y), bf.GaussianPSF(0.5), lens)
+    nuisances = bf.Nuisances("free", offset=True, psf_sigma=True, position_scatter=True)
+    counts = bf.simulate(true, theta, 20.0, seed=seed)
+    return bf.Posterior(taken, counts, nuisances=nuisances), theta
+
+
+@pytest.mark.slow
+def test_a_poor_first_psf_does_not_pass_for_scattered_positions(monkeypatch) -> None:
+    """With a Gaussian the stars seem to scatter by 0.027 px, which hides the phase of their pixels.
+
+    A PSF that was measured with that scatter alone leaves twice the true one, the control.
+    """
+    posterior, _ = undersampled(0)
+    gaussian, off = bf.find_map(posterior), []
+    for rounds in (measuring.ROUNDS, 0):
+        monkeypatch.setattr(measuring, "ROUNDS", rounds)
+        found, estimate = bf.measure_psf(posterior, gaussian)
+        k = found.parameter_names.index("position_scatter")
+        off.append((estimate.params[k] - SCATTER) / np.sqrt(estimate.covariance[k, k]))
+    assert abs(off[0]) < 3.0
+    assert off[1] > 5.0
+
+
+@pytest.mark.statistics
+def test_errors_hold_where_undersampled_stars_scatter() -> None:
+    """20 frames, 10 coefficients: the mean square is known to sqrt(2 / 200) = 0.1."""
+    squares = []
+    for seed in range(20):
+        posterior, theta = undersampled(seed)
+        found, estimate = bf.measure_psf(posterior, bf.find_map(posterior))
+        own = [found.parameter_names.index(name) for name in found.model.distortion.names]
+        off = estimate.params[own] - theta
+        squares.append(off @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], off))
+    assert 0.7 < np.mean(squares) / 10.0 < 1.3

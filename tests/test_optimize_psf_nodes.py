@@ -8,6 +8,7 @@ from scipy import linalg
 
 import bayesfred as bf
 from bayesfred.imaging.psf.spline_values import spline_coefficients
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.optimize import measure_psf as measuring
 from bayesfred.optimize.fit_psf import _measured_at_nodes, solved
 from bayesfred.optimize.psf_equations import PsfEquations, observed
@@ -48,7 +49,8 @@ def frame_of(seed, side=SIDE, grid=20, flux=3e4, number=NODES, scatter=0.0):
     stars = bf.SourceCatalog.grid(grid, 13.6, flux)  # every phase of the pixels
     rng = np.random.default_rng(seed)
     theta = rng.normal(size=10) * np.repeat([[2e-3] * 2 + [1e-5] * 3], 2, axis=0).ravel()
-    by_x, by_y = scatter * rng.normal(size=(2, len(stars)))
+    scale = scatter * np.sqrt(DOF / rng.chisquare(DOF, len(stars)))
+    by_x, by_y = scale * rng.normal(size=(2, len(stars)))
     there = replace(stars, x=stars.x + by_x, y=stars.y + by_y)
     true = bf.ForwardModel(detector, there, turning_psf(0.5 * side, number), distortion)
     counts = bf.simulate(true, theta, 20.0, seed=seed)

@@ -1,6 +1,6 @@
 """A posterior with a measured PSF: the PSF, the maximum with it, and what its errors take."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.newton import maximize
 from bayesfred.optimize.outliers import reject_once
-from bayesfred.optimize.psf_equations import LARGEST_ERROR, PsfState
+from bayesfred.optimize.psf_equations import LARGEST_ERROR, SCATTER, PsfState
 from bayesfred.optimize.psf_marginal import (
     lit_pixels,
     node_slopes,
@@ -26,6 +26,7 @@ from bayesfred.optimize.psf_marginal import (
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
 ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
+OFF = 0.2  # of the scatter of positions with which a PSF was measured
 FEW = 0.1  # of the sources, which may be lost so
 MOST = 4  # a degree, beyond which the equations of a PSF take minutes
 NODES, EACH = 7, 10  # a number of nodes, and of the sources at each that they take
@@ -106,6 +107,14 @@ def measure_psf(
             "let the PSF vary less over the field (degree)"
         )
     top = maximize(bare, start)
+    for _ in range(ROUNDS):
+        # with a poor PSF sources seemed to scatter, so that places told little of the PSF
+        closer = _scattering(posterior, state, bare.parameter_names, top.params)
+        if closer is None:
+            break
+        psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, closer)
+        bare, start = _with(posterior, (psf, state), model_error, given)
+        top = maximize(bare, start)
     if nodes:
         slopes = node_slopes(bare, state, top.params)
     elif bare.model.optics().translates:
@@ -118,6 +127,17 @@ def measure_psf(
     if reject_outliers:
         found = replace(found, message=found.message.replace(OUTLIERS, ""))
     return measured, found
+
+
+def _scattering(
+    posterior: Posterior, state: PsfState, names: Sequence[str], found: Floats
+) -> PsfState | None:
+    """The state with the positions' scatter that was found, if that is another one."""
+    if SCATTER not in names:
+        return None
+    params, k = state.params.copy(), posterior.parameter_names.index(SCATTER)
+    before, params[k] = params[k], found[names.index(SCATTER)]
+    return replace(state, params=params) if abs(params[k] - before) > OFF * before else None
 
 
 def _explained(posterior: Posterior, params: Floats) -> Flags:

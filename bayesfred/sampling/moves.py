@@ -265,10 +265,13 @@ def _nested(
             mean[j] *= np.exp(k * ratio)
             given[np.ix_(rest, rest)] = inverse(posterior.information(mean)[np.ix_(rest, rest)])
             moved = np.clip(mean + given @ posterior.gradient(mean), *posterior.support)
-            if np.isfinite(posterior.log_prob(moved)):  # at a bound there may be no density
+            value = float(posterior.log_prob(moved))
+            if np.isfinite(value):
                 mean = moved
+            else:  # at a bound there may be no density
+                value = float(posterior.log_prob(mean))
             given[j, j] = (ratio * mean[j] * width) ** 2
-            log = float(posterior.log_prob(mean)) + 0.5 * np.linalg.slogdet(given)[1]
+            log = value + 0.5 * np.linalg.slogdet(given)[1]
             if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
                 break
             means.append(mean)
