@@ -13,6 +13,11 @@ drew it to itself. With I_s the information of its pixels and H = R^-1 R^-T, u_s
 model the covariance I_s - I_s H^-1 I_s. So in units of R, where I_s is M = R^T I_s R, it is
 multiplied by (1 - M)^-1/2, which makes the sandwich of a true model H^-1 I H^-1 on average.
 
+Free fluxes and shifts of the sources, which have priors, are at their maximum given theta: u_s is
+the gradient as they stay, and I_s that of the pixels' derivatives as they stay with those as they
+follow. Where positions scatter, the shifts' own width pulls on theta against u_s: that is left out,
+and the errors come out some hundredths larger.
+
 The errors of a measured PSF are in the covariance, but in no source's u_s: H is then that of a
 known PSF. In units of R the sandwich tells how much farther the maximum scatters than it should.
 The covariance R' R'^T with the PSF's errors becomes that many times larger: R' is put in R's place.
@@ -28,14 +33,16 @@ R. M. Bell, D. F. McCaffrey (2002), Survey Methodology 28, 169: its correction f
 """
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.analysis.absorbed import absorbed
+from bayesfred.analysis.absorbed import absorbed, responses
 from bayesfred.analysis.folds import fold_sources
 from bayesfred.analysis.sources import SourceFits, fit_sources
+from bayesfred.model.kernels.fisher import EXPECTED
 from bayesfred.model.parameters import BACKGROUND_POWERS, SCALES
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
@@ -77,8 +84,15 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     measured = posterior.psf_errors is not None
     known = inverse(posterior.information(params)) if measured else covariance
     root = np.linalg.cholesky(known)  # units in which this covariance is 1
-    response = absorbed(posterior, params, known, fits).response @ root
-    response = response.swapaxes(0, 1).reshape(-1, params.size)  # by template, then by source
+    # as the information takes it: the average curvature of the shifts' prior
+    expected = replace(fits, scatter=fits.scatter / EXPECTED)
+    at_rest, followed = (
+        (response @ root).swapaxes(0, 1).reshape(-1, params.size)  # by template, then by source
+        for response in (
+            responses(posterior, params, fits),
+            absorbed(posterior, params, known, expected).response,
+        )
+    )
     light = _by_pixel(fits, owner.size)[order]
     names = posterior.nuisances.background_names
     level_moves = root[[posterior.parameter_names.index(name) for name in names]]
@@ -86,9 +100,9 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     scores = np.empty((len(ends), params.size))
     for k, (first, last) in enumerate(itertools.pairwise([0, *ends.tolist()])):
         own = slice(first, last)
-        jacobian = light[own] @ response + level_terms[own] @ level_moves
-        weighted = jacobian * weight[own, None]
-        values, vectors = np.linalg.eigh(jacobian.T @ weighted)
+        level_moved = level_terms[own] @ level_moves
+        weighted = (light[own] @ at_rest + level_moved) * weight[own, None]
+        values, vectors = np.linalg.eigh(weighted.T @ (light[own] @ followed + level_moved))
         share = np.minimum(values, DECISIVE)
         scores[k] = vectors @ ((vectors.T @ (weighted.T @ residual[own])) / np.sqrt(1.0 - share))
     sd = np.sqrt(np.sum((scores @ np.linalg.cholesky(covariance).T) ** 2, axis=0))
