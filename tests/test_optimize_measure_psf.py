@@ -12,6 +12,7 @@ from bayesfred.optimize.measure_psf import psf_message
 from bayesfred.optimize.psf_samples import likely_error
 
 THETA, FLUX, GHOSTS = [1e-3, 0.0], 2e5, 3
+SCATTER = 0.004
 
 
 def frame_with_ghosts(seed: int, flux: float, width: float) -> bf.Posterior:
@@ -100,9 +101,6 @@ def test_a_psf_that_leaves_much_should_vary_more():
         assert psf_message(posterior, replace(estimate, params=params)).endswith(said)
 
 
-SCATTER = 0.004
-
-
 def undersampled(seed: int) -> tuple[bf.Posterior, np.ndarray]:
     """144 stars of a FWHM of 1.2 pixels that lie off the catalogue, the PSF taken for a Gaussian.
 
@@ -142,12 +140,20 @@ def test_a_poor_first_psf_does_not_pass_for_scattered_positions(monkeypatch) -> 
 
 @pytest.mark.statistics
 def test_errors_hold_where_undersampled_stars_scatter() -> None:
-    """20 frames, 10 coefficients: the mean square is known to sqrt(2 / 200) = 0.1."""
-    squares = []
+    """20 frames, 10 coefficients: the mean square is known to sqrt(2 / 200) = 0.1.
+
+    The control are the errors of stars that do not scatter.
+    """
+    squares, controls = [], []
     for seed in range(20):
         posterior, theta = undersampled(seed)
         found, estimate = bf.measure_psf(posterior, bf.find_map(posterior))
         own = [found.parameter_names.index(name) for name in found.model.distortion.names]
         off = estimate.params[own] - theta
         squares.append(off @ np.linalg.solve(estimate.covariance[np.ix_(own, own)], off))
+        at_rest = estimate.params.copy()
+        at_rest[found.parameter_names.index("position_scatter")] *= 0.1
+        fixed = np.linalg.inv(found.information(at_rest))[np.ix_(own, own)]
+        controls.append(off @ np.linalg.solve(fixed, off))
     assert 0.7 < np.mean(squares) / 10.0 < 1.3
+    assert np.mean(controls) / 10.0 > 2.0

@@ -299,7 +299,7 @@ def test_errors_hold_with_a_psf_that_varies_between_nodes():
 def test_errors_hold_where_positions_scatter_too():
     """20 frames, 12 coefficients: their rms is known to 7 %, were they independent.
 
-    Were shifts not to follow the parameters, errors of the PSF would be five times as large.
+    Were shifts not to follow the parameters, all errors would be 2.2 times as large, and fail this.
     """
     stated, _ = scores(20, scatter=0.02)
     assert 0.8 < np.sqrt(np.mean(stated**2)) < 1.2

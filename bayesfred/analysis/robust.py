@@ -16,7 +16,7 @@ multiplied by (1 - M)^-1/2, which makes the sandwich of a true model H^-1 I H^-1
 Free fluxes and shifts of the sources, which have priors, are at their maximum given theta: u_s is
 the gradient as they stay, and I_s that of the pixels' derivatives as they stay with those as they
 follow. Where positions scatter, the shifts' own width pulls on theta against u_s: that is left out,
-and the errors come out some hundredths larger.
+and the errors of a true model come out 1.07 times the plain ones of 196 sources, 1.19 times of 25.
 
 The errors of a measured PSF are in the covariance, but in no source's u_s: H is then that of a
 known PSF. In units of R the sandwich tells how much farther the maximum scatters than it should.

@@ -373,9 +373,8 @@ def _at_nodes(
     """The state where the nodes are found, as precisely as this, and the equations there."""
     nodes, error, now = state.nodes, math.inf, NEAR
     assert nodes is not None, "the PSF varies between them"
-    equations = None
     for _ in range(TURNS):
-        equations = NodeEquations.of(posterior, state, known=equations)
+        equations = NodeEquations.of(posterior, state)
         nodes, change, far = equations.solved(nodes, now)
         error, before = equations.model_error, error
         if far < LITTLE and error >= SETTLED * before:

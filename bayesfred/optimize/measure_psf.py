@@ -14,7 +14,7 @@ from bayesfred.model.psf_errors import OccamFactor, PsfErrors, covariance_of, re
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import OUTLIERS, find_map
 from bayesfred.optimize.fit_psf import find_psf
-from bayesfred.optimize.newton import maximize
+from bayesfred.optimize.newton import NewtonResult, maximize
 from bayesfred.optimize.outliers import reject_once
 from bayesfred.optimize.psf_equations import LARGEST_ERROR, SCATTER, PsfState
 from bayesfred.optimize.psf_marginal import (
@@ -25,7 +25,7 @@ from bayesfred.optimize.psf_marginal import (
 )
 from bayesfred.optimize.sharp_pixels import sharp_pixels
 
-ROUNDS = 3  # of rejecting what a measured PSF does not explain, and measuring it without
+ROUNDS = 3  # of measuring a PSF without what it does not explain, or with the scatter it leaves
 OFF = 0.2  # of the scatter of positions with which a PSF was measured
 FEW = 0.1  # of the sources, which may be lost so
 MOST = 4  # a degree, beyond which the equations of a PSF take minutes
@@ -44,6 +44,8 @@ def measure_psf(
     reject_outliers: bool = False,
 ) -> tuple[Posterior, MapEstimate]:
     """Measure the PSF of a frame, and maximise the posterior with it.
+
+    Where positions scatter it is measured again with the scatter that it leaves, until that rests.
 
     Parameters
     ----------
@@ -100,13 +102,7 @@ def measure_psf(
         posterior = replace(posterior, mask=kept, extrapolation=None)
         psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, state)
         bare, start = _with(posterior, (psf, state), model_error, given)
-    if not np.isfinite(bare.log_prob(start)):
-        raise InputError(
-            "psf: got one that explains some source with no flux at all, expected images that "
-            "resemble each other: reject outliers (reject_outliers), mask what is no source's, or "
-            "let the PSF vary less over the field (degree)"
-        )
-    top = maximize(bare, start)
+    top = _maximum(bare, start)
     for _ in range(ROUNDS):
         # with a poor PSF sources seemed to scatter, so that places told little of the PSF
         closer = _scattering(posterior, state, bare.parameter_names, top.params)
@@ -114,7 +110,7 @@ def measure_psf(
             break
         psf, state, drawn = find_psf(posterior, estimate, oversampling, degree, nodes, closer)
         bare, start = _with(posterior, (psf, state), model_error, given)
-        top = maximize(bare, start)
+        top = _maximum(bare, start)
     if nodes:
         slopes = node_slopes(bare, state, top.params)
     elif bare.model.optics().translates:
@@ -127,6 +123,16 @@ def measure_psf(
     if reject_outliers:
         found = replace(found, message=found.message.replace(OUTLIERS, ""))
     return measured, found
+
+
+def _maximum(bare: Posterior, start: Floats) -> NewtonResult:
+    if not np.isfinite(bare.log_prob(start)):
+        raise InputError(
+            "psf: got one that explains some source with no flux at all, expected images that "
+            "resemble each other: reject outliers (reject_outliers), mask what is no source's, or "
+            "let the PSF vary less over the field (degree)"
+        )
+    return maximize(bare, start)
 
 
 def _scattering(

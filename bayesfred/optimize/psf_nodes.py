@@ -46,7 +46,6 @@ CHOICES = 10  # of the strength, at the most
 SETTLED = 0.1  # change of its logarithm
 NEAR = 1e-3  # of a solution that others will follow
 PRECISE = 1e-4  # of the last one: the whole is thousands of standard deviations long
-ALIKE = 0.1  # change of the model error, whose weights are nearly the same
 ROUGH = 0.01  # where its product with the slope is wanted, which is off by the square
 STEPS = 2000  # of conjugate gradients
 TINY = 1e-9  # of its information that is added to what a source says of itself
@@ -102,12 +101,8 @@ class NodeEquations:
         state: PsfState,
         error: float | None = None,
         outlying: float = OUTLYING,
-        known: "NodeEquations | None" = None,
     ) -> "NodeEquations":
-        """The equations at a state; without a model error that is given the residuals tell it.
-
-        With equations that are `known` at a state nearby their coordinates serve once more.
-        """
+        """The equations at a state; without a model error that is given the residuals tell it."""
         data = PsfSamples.at(posterior, state.params, state.shifts, state.grid.radius)
         pixels = observed(posterior, state, data, error, outlying)
         side, prior, conventions = state.grid.at_nodes
@@ -137,17 +132,14 @@ class NodeEquations:
         lengths[lengths == 0.0] = np.inf  # what is known changes by 0
         eliminated = (eliminated @ sparse.diags_array(1.0 / lengths)).tocsr()
         values = np.column_stack([state.fluxes, state.shifts]).ravel()
-        precision, tied = shift_precision(posterior, state), np.zeros((2, lengths.size))
-        tied[:, : precision.size] = precision, precision * values
+        precision, known = shift_precision(posterior, state), np.zeros((2, lengths.size))
+        known[:, : precision.size] = precision, precision * values
         weights = node_weights(posterior, state.nodes.number)
         residual = pixels.score / root + splines @ state.nodes.splines(weights).ravel()
-        out = cls(
-            residual, splines, templates, parameters, eliminated, lengths, tied, weights,
+        return cls(
+            residual, splines, templates, parameters, eliminated, lengths, known, weights,
             prior.roughness.toarray() + np.diag(prior.amplitude), conventions, pixels.model_error,
         )  # fmt: skip
-        if known and abs(out.model_error - known.model_error) <= ALIKE * known.model_error:
-            out.__dict__["coordinates"] = known.coordinates
-        return out
 
     @property
     def knots(self) -> int:
@@ -155,7 +147,7 @@ class NodeEquations:
         return len(self.precision)
 
     @cached_property
-    def _known(self) -> sparse.csc_array:
+    def _about_eliminated(self) -> sparse.csc_array:
         """The information about what is eliminated."""
         own = self.eliminated.T @ (self.templates.T @ self.templates) @ self.eliminated
         known = self.known[0] / self.lengths**2 + TINY
@@ -163,7 +155,7 @@ class NodeEquations:
 
     @cached_property
     def _own(self) -> SuperLU:
-        return splu(self._known)
+        return splu(self._about_eliminated)
 
     def _explained(self, values: Floats, tied: Floats | float = 0.0) -> Floats:
         """The change of what is eliminated that explains values, in columns of unit length.
@@ -334,7 +326,7 @@ class NodeEquations:
         # fluxes and shifts of single sources follow the parameters, too
         images, size = self.templates @ self.parameters, self.parameters.shape[1]
         single = self.templates @ self.eliminated[:, :-size]
-        images -= single @ splu(self._known[:-size, :-size]).solve(single.T @ images)
+        images -= single @ splu(self._about_eliminated[:-size, :-size]).solve(single.T @ images)
         pulls = [self._pull(image) for image in images.T]
         none = np.zeros_like(pulls[0])
         moved = [
