@@ -148,7 +148,7 @@ def test_scores_are_those_of_dense_algebra() -> None:
     more = replace(model, distortion=_with_more_terms(model.polynomial))
     score, covariance = dense_scores(posterior, params, more)
     scale = np.sqrt(np.diag(covariance))
-    assert len(found.names) == 4 + 5 + 6
+    assert len(found.names) == 4 + 5 + 6 + 8
     assert found.score / scale == pytest.approx(score / scale, abs=1e-5)
     assert found.covariance / np.outer(scale, scale) == pytest.approx(
         covariance / np.outer(scale, scale), abs=1e-5
@@ -187,7 +187,7 @@ def test_added_terms_leave_the_others_as_they_are(lens: PolynomialDistortion) ->
     design, own = more.design_matrix(*point), lens.design_matrix(*point)
     assert design[:, : lens.n_terms] == pytest.approx(own, rel=1e-12)
     x, y = point[2:]
-    degree = 1 + max(sum(term) for term in (*lens.f_terms, *lens.g_terms))
+    degree = 2 + max(sum(term) for term in (*lens.f_terms, *lens.g_terms))
     assert len(set(names)) == len(names)
     assert f"f_x{degree}" in names and f"g_y{degree}" in names and f"f_x{degree + 1}" not in names
     assert design[:, names.index("f_xy")] == pytest.approx([x * y, 0.0])

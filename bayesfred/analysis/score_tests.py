@@ -25,9 +25,11 @@ fixed. S / Var S is the step of Fisher's scoring, an estimate of phi less its va
 variance 1 / Var S.
 
 What is tested: the PSF's width, the pointing, a common factor of the fluxes, a slope and a
-curvature of the background, and every term x^i y^j that the distortion lacks, up to one degree more
-than it has. What the fitted parameters can stand in for, so that less than a hundredth of I_phi,phi
-is left, is not: there the terms of second order in the errors of theta matter.
+curvature of the background, and every term x^i y^j that the distortion lacks, up to two degrees
+more than it has. A lens that is symmetric about its axis has odd degrees only, so after degree 3
+the next that it needs is 5. What the fitted parameters can stand in for, so that less than a
+hundredth of I_phi,phi is left, is not tested: there the terms of second order in the errors of
+theta matter.
 
 One thing that is wrong moves many of these numbers. `leading` names the one that explains most,
 frees it, and goes on while another is significant beside those it has freed.
@@ -124,6 +126,16 @@ class ScoreTests:
             covariance -= np.outer(column, column) / column[best]
             left &= np.diag(covariance) > LEAST * full
         return tuple(found)
+
+    def joint(self, starts: tuple[str, ...]) -> tuple[float, int]:
+        """Chi-square of all tested numbers whose names start so, and its degrees of freedom."""
+        some = self.tested & np.array([name.startswith(starts) for name in self.names], dtype=bool)
+        scale = 1.0 / np.sqrt(np.diag(self.covariance)[some])
+        correlation = self.covariance[np.ix_(some, some)] * np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(correlation)
+        told = values > LEAST  # apart from the others
+        along = (self.score[some] * scale) @ vectors[:, told]
+        return float(np.sum(along**2 / values[told])), int(told.sum())
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -234,10 +246,10 @@ def _largest_order(posterior: Posterior) -> int:
 
 
 def _with_more_terms(distortion: PolynomialDistortion) -> PolynomialDistortion:
-    """The distortion with every x^i y^j that it lacks, up to one degree more than it has."""
+    """The distortion with every x^i y^j that it lacks, up to two degrees more than it has."""
     own, given = distortion.names, (distortion.f_terms, distortion.g_terms)
     old = _named(given)
-    degree = 1 + max(sum(term) for _, term in old)
+    degree = 2 + max(sum(term) for _, term in old)
     powers = [(i, total - i, 0, 0) for total in range(1, degree + 1) for i in range(total, -1, -1)]
     f, g = ((*each, *(term for term in powers if term not in each)) for each in given)
     rows = _named((f, g))

@@ -7,6 +7,7 @@ displacements f and g from these functions.
 from __future__ import annotations
 
 import operator
+import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -59,6 +60,11 @@ def term_name(letter: str, term: Sequence[int]) -> str:
         symbol if power == 1 else f"{symbol}{power}" for symbol, power in powers if power > 0
     ]
     return f"{letter}_{''.join(written) or '1'}"
+
+
+def degree_of(name: str) -> int:
+    """The sum of the powers of a term by its name: 3 of f_u2x."""
+    return sum(int(power or 1) for power in re.findall(r"[uvxy](\d*)", name[2:]))
 
 
 def broadcast(u: ArrayLike, v: ArrayLike, x: ArrayLike, y: ArrayLike) -> Point:

@@ -64,6 +64,12 @@ def scatter_remedy(posterior: Posterior) -> str:
     return f"set {fluxes}nuisances.position_scatter = true"
 
 
+def terms_remedy(degree: int) -> str:
+    """What adds terms up to a degree."""
+    terms = f"a polynomial of degree {degree} (distortion.degree)"
+    return f"add terms to the distortion, such as {terms}"
+
+
 def psf_remedy(posterior: Posterior, other: str) -> str:
     """What to do about a wrong PSF: of a measured one, and of any other."""
     return varying_more(posterior) or other

@@ -2,10 +2,12 @@
 
 The displacements of the sources' light from their images are regressed on patterns, each set
 including the one before: what the model's own coefficients can still do, a constant, a linear map,
-every term of degree 3. The model's own patterns come first because a fit with terms that are
-missing bends those that it has: what is missing is only visible beside them. The smallest set is
-named that explains nearly what the largest does. Images far from their light have no displacement
-that could be measured; then the catalogue is searched for among the peaks.
+then every term of degree 2, of degree 3, up to two degrees more than the model has. The model's own
+patterns come first because a fit with terms that are missing bends those that it has: what is
+missing is only visible beside them. The smallest set is named that explains nearly what the largest
+does, if that is more than so many numbers explain of displacements without a pattern. Images far
+from their light have no displacement that could be measured; then the catalogue is searched for
+among the peaks.
 """
 
 from typing import NamedTuple
@@ -13,15 +15,24 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.analysis.causes.cause import RICHER, Cause, Finding, scatter_remedy
+from bayesfred.analysis.causes.cause import (
+    RICHER,
+    Cause,
+    Finding,
+    scatter_remedy,
+    terms_remedy,
+)
 from bayesfred.analysis.causes.context import BRIGHT, Context
 from bayesfred.analysis.causes.search import Placement, find_placement
 from bayesfred.optimize.matching import Field
 
+HIGHEST = 3  # degree of the patterns that are tried at least
 ENOUGH = 0.85  # of what the largest set of patterns explains
 MOST_LOST = 0.05  # share of the sources that are seen nowhere near their image
 MORE = 1.1  # times as many sources as the fit matches
 NEAR_HALF = 0.04  # of the frame's side: distance of a shift from half of it
+WRONG = 30.0  # times the median square: sources whose squares count as no more
+MORE_NUMBERS = 2  # times as many coordinates as patterns, or these describe anything
 ROUNDS = 6
 
 
@@ -151,17 +162,19 @@ def _by_half(context: Context, found: Placement) -> bool:
 
 
 def _gained(context: Context, measured: Displaced, rest: Floats) -> float:
-    """Sum of squares that goes if the displacements become `rest`; see the package's head."""
+    """Sum of squares that goes if the displacements become `rest`."""
+    before, after = (_held(context, measured, by) for by in (measured.displacement, rest))
+    return float(np.sum(before - after))
+
+
+def _held(context: Context, measured: Displaced, by: Floats) -> Floats:
+    """Sum of squares of each source that is displaced `by` so much; see the package's head."""
     s = context.light.width
-
-    def held(by: Floats) -> Floats:
-        squared = np.sum(np.where(np.isfinite(by), by, 1e3 * s) ** 2, axis=1)
-        apart = -np.expm1(-squared / (4.0 * s**2))
-        # the farther from the model's light, the less variance the model has where light is
-        missing = context.missing_power[measured.sources]
-        return np.asarray(apart * (2.0 * measured.power + apart * (missing - measured.power)))
-
-    return float(np.sum(held(measured.displacement) - held(rest)))
+    squared = np.sum(np.where(np.isfinite(by), by, 1e3 * s) ** 2, axis=1)
+    apart = -np.expm1(-squared / (4.0 * s**2))
+    # the farther from the model's light, the less variance the model has where light is
+    missing = context.missing_power[measured.sources]
+    return np.asarray(apart * (2.0 * measured.power + apart * (missing - measured.power)))
 
 
 def _patterns(context: Context, measured: Displaced, how: str = "") -> Finding | None:
@@ -170,10 +183,15 @@ def _patterns(context: Context, measured: Displaced, how: str = "") -> Finding |
     rests = [_rest(matrix, measured) for matrix in sets]
     gains = [_gained(context, measured, rest) for rest in rests]
     numbers = [matrix.shape[1] for matrix in sets]
-    if not gains or gains[-1] < 5.0 * numbers[-1]:
+    if not gains:
+        return None
+    # the square that noise or scatter leaves of a coordinate, but for a few wrong sources
+    held = _held(context, measured, rests[-1])
+    each = np.minimum(held, WRONG * np.median(held)).sum() / (2 * held.size - numbers[-1])
+    if gains[-1] < 5.0 * numbers[-1] * max(each, 1.0):
         return None
     level = int(np.argmax(np.array(gains) >= ENOUGH * max(gains)))
-    name = ("own", "shift", "rotation or scale", "missing terms")[level]
+    name = ("own", "shift", "rotation or scale", "missing terms")[min(level, 3)]
     explained = gains[level] - numbers[level]
     taken = rests[0] - rests[level] if level else measured.displacement
     size = np.hypot(*taken.T)
@@ -206,7 +224,7 @@ def _patterns(context: Context, measured: Displaced, how: str = "") -> Finding |
             name, 0.0,
             f"{how}displacements that the terms do not describe vary smoothly over the field, up "
             f"to {size[largest]:.3g} pixels at u, v = {at}",
-            "add terms to the distortion, such as a polynomial of a higher degree",
+            terms_remedy(level - 1),
         )  # fmt: skip
     return Finding(cause, explained, "position")
 
@@ -218,12 +236,16 @@ def _designs(context: Context, measured: Displaced) -> list[Floats]:
     own = Field(context.posterior).design(measured.sources, measured.position * step)
     half = 0.5 * max(model.detector.fine_shape)
     x, y = model.sources.x[measured.sources] / half, model.sources.y[measured.sources] / half
+    lens = model.polynomial
+    fitted = set(lens.f_terms) & set(lens.g_terms) if lens.basis is None else set()
     sets, matrix = [], own.reshape(2 * n, -1)
-    for degrees in ((), (0,), (1,), (2, 3)):
-        terms = [x**i * y ** (d - i) for d in degrees for i in range(d + 1)]
+    top = max(HIGHEST, 2 + max(sum(term) for term in (*lens.f_terms, *lens.g_terms)))
+    for degree in range(-1, top + 1):  # none, then a constant
+        powers = [(i, degree - i) for i in range(degree + 1)]
+        terms = [x**i * y**j for i, j in powers if (i, j, 0, 0) not in fitted]
         more = [np.concatenate(pair) for t in terms for pair in ((t, 0.0 * t), (0.0 * t, t))]
         matrix = np.column_stack([matrix, *more])
-        if 2 * n < matrix.shape[1] + 4:
+        if 2 * n < MORE_NUMBERS * matrix.shape[1] + 4:
             break
         sets.append(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
     return sets

@@ -2,24 +2,34 @@
 
 They come from the tests of `bayesfred.analysis.score_tests` and `bayesfred.analysis.source_tests`.
 The misfit that they share out is that of the sources' own scores: the excess of the sum of their
-squares. Numbers in the model explain the squares of their scores, one beside those before it.
+squares. Numbers in the model explain the squares of their scores, one beside those before it. Terms
+of the distortion are freed together, and positions that scatter give scores to all of them. So the
+terms explain the joint chi-square of their scores, less what the sources' positions would give to
+so many numbers if they scattered by what the terms leave. Scatter explains the rest.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
 from bayesfred._typing import Ints
-from bayesfred.analysis.causes.cause import RICHER, Cause, Finding, psf_remedy, scatter_remedy
+from bayesfred.analysis.causes.cause import (
+    RICHER,
+    Cause,
+    Finding,
+    psf_remedy,
+    scatter_remedy,
+    terms_remedy,
+)
 from bayesfred.analysis.causes.find import ranked
 from bayesfred.analysis.causes.light import FEW, NAMED
 from bayesfred.analysis.score_tests import Lead, ScoreTests
 from bayesfred.analysis.source_tests import KINDS, SourceTests
+from bayesfred.imaging.monomials import degree_of
 from bayesfred.model.posterior import Posterior
 
 NOISE = 2.0  # standard deviations by which a spread has to explain more than chance
-MORE_TERMS = (
-    "missing terms",
-    "add terms to the distortion, such as a polynomial of a higher degree",
-)
+MORE_TERMS = ("missing terms", "")
 # The cause, and what frees a number that a score test finds wrong, by the beginning of its name.
 REMEDIES = {
     "flux_scale": ("fluxes", 'set nuisances.flux = "scale"'),
@@ -61,7 +71,10 @@ def hidden_causes(
     squares = np.where(np.isfinite(tests.z), tests.z**2 - 1.0, 0.0)
     own = np.sum(squares[:, 1:], axis=1)
     findings = [
-        _numbers(posterior, name, leads) for name, leads in _by_remedy(scores.leading).items()
+        _terms(_numbers(posterior, which, leads), leads, scores, tests)
+        if which == MORE_TERMS
+        else _numbers(posterior, which, leads)
+        for which, leads in _by_remedy(scores.leading).items()
     ]
     failed = np.flatnonzero(tests.failed)
     few = failed.size <= max(2, FEW * own.size)
@@ -75,14 +88,16 @@ def hidden_causes(
         cause = Cause("PSF", 0.0, text, psf_remedy(posterior, "fit another PSF"))
         findings.append(Finding(cause, profile, "PSF", RICHER))
     others = squares[~tests.failed] if few else squares
+    smooth = sum(finding.explained for finding in findings if finding.cause.name == MORE_TERMS[0])
     for spread in tests.failed_spreads:
         kind, text = SPREADS[spread.name]
-        remedy, pixel = 'set nuisances.flux = "free"', 1.0
+        remedy, pixel, taken = 'set nuisances.flux = "free"', 1.0, 0.0
         if spread.name == "positions":
             remedy, pixel = scatter_remedy(posterior), posterior.model.detector.binning
+            taken = smooth
         cause = Cause(spread.name, 0.0, text.format(spread.estimate / pixel), remedy)
         some = others[:, KINDS[kind]]
-        explained = float(some.sum()) - NOISE * (2.0 * some.size) ** 0.5
+        explained = float(some.sum()) - NOISE * (2.0 * some.size) ** 0.5 - taken
         findings.append(Finding(cause, explained, spread.name, RICHER))
     total = max([float(own.sum()), *(finding.explained for finding in findings)], default=0.0)
     return ranked(findings, total)
@@ -109,6 +124,17 @@ def _numbers(posterior: Posterior, which: tuple[str, str], leads: list[Lead]) ->
     if more := ", ".join(lead.name for lead in leads[1:]):
         text += f" (further: {more})"
     return Finding(Cause(name, 0.0, text, remedy), sum(lead.z**2 for lead in leads), name)
+
+
+def _terms(finding: Finding, leads: list[Lead], scores: ScoreTests, tests: SourceTests) -> Finding:
+    """Terms of the distortion that are missing."""
+    joint, number = scores.joint(("f_", "g_"))
+    place = tests.z[:, KINDS["position"]]
+    others = max(int(np.isfinite(place).sum()) - number, 1)
+    each = max((float(np.nansum(place**2)) - joint) / others, 1.0)
+    explained = max(leads[0].z ** 2 - each, joint - number * each)
+    remedy = terms_remedy(max(degree_of(lead.name) for lead in leads))
+    return replace(finding, cause=replace(finding.cause, remedy=remedy), explained=explained)
 
 
 def _few_sources(posterior: Posterior, failed: Ints, explained: float) -> Finding:
