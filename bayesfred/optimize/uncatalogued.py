@@ -12,6 +12,9 @@ stands near one star of many. So near stars a peak has to exceed, too, 2.5 times
 common: the 75 % quantile of the bright stars'. Where such peaks stand near more than a few stars,
 it is the PSF still, and the share is doubled until they do not.
 
+Light within the filter's reach of masked pixels at a star's image, such as saturated ones, is that
+star's: its wings end at a hole there, and no fainter star shows as much of the PSF's misfit.
+
 Light that is sharper than the stars' is no source but a hot pixel or a cosmic ray. What the eight
 pixels beside a star's middle one hold of what that one holds is least where the image is in the
 middle of the pixel: rho, the 10 % quantile of the bright stars'. A pixel with less than half of rho
@@ -38,6 +41,7 @@ COMMON = 0.75  # quantile of the bright stars' shares that is the PSF's
 MISFIT = 2.5  # times that
 STARS = 40  # of which it is measured, the brightest third and at least 5
 FARTHEST = 8.0  # filter widths from a star to which the PSF's misfit is followed
+TRUNCATED = 4.0  # filter widths at which the filter ends
 RINGS = 2  # a filter width
 FEW, MANY = 5, 0.05  # so many near stars, or this share of the stars, may be found
 LOOSER = 6  # times the misfit is doubled, at most, until they are so few: then it is the PSF's
@@ -168,10 +172,11 @@ class _Filtered:
         self.rows, self.images, self.flux = np.flatnonzero(seen), images[seen], self.flux[seen]
         self.sharp = self._sharp()
         self.valid = posterior.valid & ~self.sharp
-        reach = 2 * int(np.ceil(4.0 * self.width)) + 1
+        reach = 2 * int(np.ceil(TRUNCATED * self.width)) + 1
         delta = np.zeros((reach, reach))
         delta[reach // 2, reach // 2] = 1.0
         self.square = ndimage.gaussian_laplace(delta, self.width) ** 2
+        self.own = self._beside_masked()
         self.sd = self.noise(self.variance)
         self.misfit = self._misfit(self._excess(np.zeros((0, 3))))
 
@@ -186,16 +191,33 @@ class _Filtered:
         usable = whole[at] & (own[at] > 0.0)
         if usable.sum() < FEWEST:
             return np.zeros(valid.shape, bool)
-        sharpest = float(np.quantile((beside[at] / np.abs(own[at]))[usable], SHARPEST))
+        sharpest = float(np.quantile(beside[at][usable] / own[at][usable], SHARPEST))
         share = min(SHARP * sharpest, MOST_BESIDE)
         variance = (12.0 + share**2) * self.variance + share * (1.0 + share) * np.abs(own)
         missing = share * own - np.maximum(beside, 0.0)
         return np.asarray(whole & (missing > SIGNIFICANCE * np.sqrt(variance)))
 
+    def _beside_masked(self) -> Flags:
+        """Pixels within the filter's reach of a star's masked ones: their light is the star's.
+
+        Masked pixels that touch each other are a star's where its image is on or next to them.
+        """
+        masked, _ = ndimage.label(~self.posterior.valid, np.ones((3, 3)))
+        at = tuple(np.rint(self.images[self._inside()]).astype(int).T)
+        owned = np.setdiff1d(ndimage.maximum_filter(masked, 3)[at], 0)
+        if not owned.size:
+            return np.zeros(masked.shape, bool)
+        distance = ndimage.distance_transform_edt(~np.isin(masked, owned))
+        return np.asarray(distance <= TRUNCATED * self.width)
+
+    def _inside(self) -> Flags:
+        """Which images are in the frame."""
+        shape = np.array(self.residual.shape)
+        return np.asarray(np.all((self.images > 0) & (self.images < shape - 1), axis=1))
+
     def _brightest(self) -> Ints:
         """The brightest third of the stars in the frame, at least 5."""
-        shape = np.array(self.residual.shape)
-        inside = np.all((self.images > 0) & (self.images < shape - 1), axis=1)
+        inside = self._inside()
         order = np.flatnonzero(inside)[np.argsort(-self.flux[inside])]
         return order[: max(len(order) // 3, 5)]
 
@@ -280,7 +302,7 @@ class _Filtered:
         limit = SIGNIFICANCE * self.sd + SIGNIFICANCE**2 / self.area
         peak = np.zeros(excess.shape, bool)
         inner = slice(int(np.ceil(self.width)), -int(np.ceil(self.width)))  # the edge is mirrored
-        peak[inner, inner] = (self.valid & (excess > limit))[inner, inner]
+        peak[inner, inner] = (self.valid & ~self.own & (excess > limit))[inner, inner]
         row, column = np.nonzero(peak & (excess == ndimage.maximum_filter(excess, size)))
         places = np.stack([row, column], axis=1).astype(np.float64)
         above = excess[row, column] - limit[row, column]
