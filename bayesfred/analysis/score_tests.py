@@ -52,13 +52,14 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.checks import Check, largest_deviate, not_tested
 from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
-from bayesfred.imaging.monomials import Exponents, term_name
+from bayesfred.imaging.monomials import Exponents, degree_of, term_name
 from bayesfred.model.parameters import parameter_table
 from bayesfred.model.posterior import Posterior
 
 __all__ = ["FALSE_ALARM", "Lead", "ScoreTests", "score_tests"]
 
 FALSE_ALARM = 0.003  # chance that any of these tests fails if the model is true
+RARE = 0.01  # of which the terms of the highest degree have
 LEAST = 0.01  # share of a number's information that the fitted parameters must leave
 MEANING = "what a fit would add to it, by its score"
 
@@ -104,9 +105,18 @@ class ScoreTests:
         )
 
     @property
-    def limit(self) -> float:
-        """The z that any of them exceeds by chance in `FALSE_ALARM` of all true models."""
-        return float(-special.ndtri(0.5 * FALSE_ALARM / max(int(np.sum(self.tested)), 1)))
+    def limits(self) -> Floats:
+        """The z that any of them exceeds by chance in `FALSE_ALARM` of all true models, shape (k,).
+
+        The many terms of the highest degree have a hundredth of that chance, so that they hide none
+        of the others: where they are missing they are far off.
+        """
+        terms = np.array([name.startswith(("f_", "g_")) for name in self.names], dtype=bool)
+        degrees = np.array([degree_of(name) for name in self.names]) * terms
+        highest = terms & (degrees == degrees.max(initial=0))
+        shared = np.where(highest, RARE, 1.0 - RARE) * FALSE_ALARM
+        number = np.where(highest, *(np.sum(self.tested & some) for some in (highest, ~highest)))
+        return np.asarray(-special.ndtri(0.5 * shared / np.maximum(number, 1)))
 
     @property
     def leading(self) -> tuple[Lead, ...]:
@@ -116,8 +126,8 @@ class ScoreTests:
         full, left = np.diag(covariance).copy(), np.array(self.tested, dtype=bool)
         while left.any():
             z = np.where(left, score / np.sqrt(np.where(left, np.diag(covariance), 1.0)), 0.0)
-            best = int(np.argmax(np.abs(z)))
-            if not abs(z[best]) > self.limit:
+            best = int(np.argmax(np.where(np.abs(z) > self.limits, np.abs(z), 0.0)))
+            if not abs(z[best]) > self.limits[best]:
                 break
             step = score[best] / covariance[best, best]
             found.append(Lead(self.names[best], float(z[best]), float(self.values[best]), step))
