@@ -1,8 +1,8 @@
 """Noise and the log-posterior against scipy and dense images; the frames that all tests of
 inference use."""
 
+import dataclasses
 import math
-import queue
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -532,15 +532,41 @@ def test_nuisances_are_checked(choice: dict[str, Any]) -> None:
         Nuisances(**choice)
 
 
-def test_workspaces_return_to_the_queue() -> None:
+@pytest.mark.parametrize("scatter", [False, True])
+@pytest.mark.parametrize("model_error", [False, True])
+def test_derivatives_begin_with_what_log_prob_found(scatter: bool, model_error: bool) -> None:
+    """They are those of a search of their own, and what they begin with is used."""
+    model = make_model()
+    nuisances = Nuisances("free", position_scatter=scatter, model_error=model_error)
+    truth = {**make_truth(model, np.random.default_rng(1)), "position_scatter": 0.05}
+    fresh, params = make_posterior(model, truth, np.random.default_rng(2), nuisances)
+    after = dataclasses.replace(fresh)
+    after.log_prob(params)
+    known = after.likelihood._last.at(params)
+    assert known[:, 0] == pytest.approx(fresh.fluxes(params), rel=1e-7)
+    assert after.likelihood._last.at(params + 1e-9).size == 0
+    sd = np.sqrt(np.diag(np.linalg.inv(fresh.information(params))))
+    alone = dataclasses.replace(fresh)
+    assert after.gradient(params) * sd == pytest.approx(alone.gradient(params) * sd, abs=1e-6)
+    found, wanted = (each.information(params) * np.outer(sd, sd) for each in (after, alone))
+    assert found == pytest.approx(wanted, abs=1e-6)
+    # from elsewhere it is the same maximum, and from nowhere there is none
+    for factor, same in ((1.02, True), (math.nan, False)):
+        moved = dataclasses.replace(fresh)
+        moved.likelihood._last.keep(params[None], np.zeros(1), (factor * known)[None])
+        close = moved.gradient(params) * sd == pytest.approx(alone.gradient(params) * sd, abs=1e-6)
+        assert close == same
+
+
+def test_workspaces_are_used_again() -> None:
     posterior, truth = make_posterior(
         make_model(), make_truth(make_model(), np.random.default_rng(1)), np.random.default_rng(2)
     )
     for _ in range(5):
         posterior.log_prob(np.repeat(truth[None], 6, axis=0))
         posterior.gradient(truth)
-    assert isinstance(posterior.likelihood._workspaces, queue.SimpleQueue)
-    assert posterior.likelihood._workspaces.qsize() <= nb.config.NUMBA_NUM_THREADS
+    idle = posterior.likelihood._workspaces._idle.qsize()
+    assert 1 <= idle <= nb.config.NUMBA_NUM_THREADS
 
 
 @pytest.mark.parametrize("noise", [PoissonNoise(), PoissonNoise(3.0), BackgroundNoise()])

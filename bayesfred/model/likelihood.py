@@ -5,8 +5,7 @@ arguments, and what they differentiate by becomes parameters again, through one 
 thread evaluates in a workspace of its own, which is kept for the next call.
 """
 
-import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
@@ -19,6 +18,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import Basis, Optics, stride
 from bayesfred.imaging.kernels.render import render as render_sources
+from bayesfred.model.buffers import UNKNOWN, LastProfiled, Workspaces
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.contexts import (
@@ -99,21 +99,24 @@ class FrameLikelihood:
         arguments, rows = self._arguments(vectors), np.arange(len(vectors))
         if isinstance(self.extrapolation, FluxExtrapolation):
             known = {"extrapolated": self.extrapolation.at(vectors)}
-            self._evaluate(partial(extrapolated_log_likelihoods, **known), arguments, out)
+            kernel = partial(extrapolated_log_likelihoods, **known)
+            self._evaluate(kernel, arguments, out, UNKNOWN[None])
             rows = np.flatnonzero(np.isnan(out))
         left = np.nan_to_num(out[rows], neginf=-np.inf)
-        self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left)
+        found = self._last.room(vectors)
+        self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left, found)
         out[rows] = left
+        self._last.keep(vectors, left, found)
         if self.occam:
             there = out > -np.inf
             out[there] += self.occam.log(vectors[there, self._error])
         return out + self._constant
 
-    def _evaluate(self, kernel: Callable[..., None], vectors: Vectors, out: Floats) -> None:
-        problem, turns = self.near_problem, Turns(np.zeros(1, np.int64), out)
+    def _evaluate(self, kernel: Any, vectors: Vectors, out: Floats, found: Floats) -> None:
+        problem, turns = self.near_problem, Turns(np.zeros(1, np.int64), out, found)
 
         def work() -> None:
-            with self._workspace() as w:
+            with self._workspaces.one() as w:
                 kernel(problem, w, vectors, turns=turns)
 
         if out.size:  # what nothing needs is not compiled
@@ -125,6 +128,7 @@ class FrameLikelihood:
             slow = not self.noise.discrete and hasattr(self._frame.noise, "near")
             fixed = self.nuisances.profiled == 0
             return self._with(Around(params, covariance)) if slow and fixed else self
+        self._last.forget()
         out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
             slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
@@ -153,8 +157,8 @@ class FrameLikelihood:
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
         sources, background = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
+        out = sources, background
         with self._rendered(params) as (w, rendered, parameters):
-            out = sources, background
             slopes, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if np.isnan(slopes[0]):
             return np.full(len(self.parameters), np.nan)
@@ -325,27 +329,23 @@ class FrameLikelihood:
         return chain_rule(self.parameters, params, self.model.polynomial, self._moving)
 
     @contextmanager
-    def _workspace(self) -> Iterator[Workspace]:
-        """A workspace that no other thread uses meanwhile."""
-        try:
-            workspace = self._workspaces.get_nowait()
-        except queue.Empty:
-            start = np.array([parameter.start for parameter in self.parameters])
-            workspace = new_workspace(self._optics, self._one(start).nuisances, self._free)
-        yield workspace
-        self._workspaces.put(workspace)
-
-    @contextmanager
     def _rendered(self, params: Floats) -> Iterator[tuple[Workspace, Rendered, Parameters]]:
         """A workspace in which the sources are rendered, for one parameter vector."""
-        parameters = self._one(params)
-        with self._workspace() as w:
-            yield w, render(self._problem, w, parameters), parameters
+        parameters, start = self._one(params), self._last.at(params)
+        with self._workspaces.one() as w:
+            rendered = render(self._problem._replace(start=start), w, parameters)
+            self._last.keep_rendered(params, rendered)
+            yield w, rendered, parameters
             clear(w)
 
     @cached_property
-    def _workspaces(self) -> "queue.SimpleQueue[Workspace]":
-        return queue.SimpleQueue()
+    def _last(self) -> LastProfiled:
+        return LastProfiled(len(self.model.sources) if self._free else 0)
+
+    @cached_property
+    def _workspaces(self) -> Workspaces:
+        start = self._one(np.array([parameter.start for parameter in self.parameters]))
+        return Workspaces(partial(new_workspace, self._optics, start.nuisances, self._free))
 
     @cached_property
     def _optics(self) -> Optics:
@@ -379,7 +379,7 @@ class FrameLikelihood:
     @cached_property
     def _problem(self) -> Problem:
         flux, shape = self.model.sources.flux, self.nuisances.flux_shape
-        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free)
+        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free, UNKNOWN)
 
     @cached_property
     def near_problem(self) -> Problem:

@@ -104,11 +104,11 @@ def add_product(layout, s, rows, flux, canvas, alone):
             _set_line(line, factor, alone.image[alone.at[i] : alone.at[i] + n])
 
 
-@shared(_nrt=False)
-def add_product_templates(lines, fp, s, flux, stamps, wider):
-    """Do what `render.add_templates` does; False without lines."""
-    if lines is None:
-        return False
+@shared()
+def add_product_templates(layout, s, flux, stamps, wider):
+    """Do what `render.add_templates` does."""
+    fp = layout.footprints
+    lines = _product_lines(layout, s, fp.first[s], fp.first[s + 1])
     for i in range(fp.first[s], fp.first[s + 1]):
         a, b = lines.columns[:, fp.low[i] - lines.low :], lines.rows[:, fp.row[i] - lines.top]
         own = slice(fp.start[i], fp.start[i + 1])
@@ -117,7 +117,6 @@ def add_product_templates(lines, fp, s, flux, stamps, wider):
         _add_line(a[0], flux * b[1], stamps[2, own])
         if wider is not None:
             _add_two(a[3], flux * b[0], a[0], flux * (b[3] - 2.0 * b[0]), wider[own])
-    return True
 
 
 @shared(_nrt=False)

@@ -20,7 +20,6 @@ from bayesfred.imaging.kernels.products import (
     add_product,
     add_product_templates,
     by_image,
-    lines_of,
 )
 from bayesfred.imaging.kernels.psf_dispatch import (
     fill_psf_row,
@@ -86,18 +85,9 @@ def _add_by_product(layout, s, rows, flux, canvas, alone):
 add_source = by_image(_add_by_product, _add_by_samples)
 
 
-@shared(fastmath=FAST)
-def add_templates(layout, s, flux, stamps, wider):
-    """Add K, F X and F Y of source s to its rows of `stamps`, shape (3, samples).
-
-    X = -p_a |D| is K's derivative as the source moves along a, Y along b. `wider` is None or where
-    F dK/dln(sigma) is added, F (a X + b Y - 2 K) because p is homogeneous of degree -2 in a, b and
-    sigma.
-    """
+@shared(_nrt=False, fastmath=FAST)
+def _add_sample_templates(layout, s, flux, stamps, wider):
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
-    lines = lines_of(layout, s, fp.first[s], fp.first[s + 1])
-    if add_product_templates(lines, fp, s, flux, stamps, wider):
-        return
     source = one_source(layout.geometry, s)
     offsets, weights, step, ramp = o.offsets, o.weights, o.step, o.ramp
     rd, ra, rb = work[1], work[2], work[3]
@@ -130,6 +120,20 @@ def add_templates(layout, s, flux, stamps, wider):
                     row_b[n] += flux * inverse * k_b * abs(j)
                     if wider is not None:
                         row_s[n] += flux * (inverse * (a * k_a + b * k_b) - 2.0 * k) * abs(j)
+
+
+def _templates_by_samples(layout, s, flux, stamps, wider):
+    _add_sample_templates(layout, s, flux, stamps, wider)
+
+
+def _templates_by_product(layout, s, flux, stamps, wider):
+    add_product_templates(layout, s, flux, stamps, wider)
+
+
+# Add K, F X and F Y of source s to its rows of `stamps`, shape (3, samples). X = -p_a |D| is K's
+# derivative as the source moves along a, Y along b. `wider` is None or where F dK/dln(sigma) is
+# added, F (a X + b Y - 2 K) because p is homogeneous of degree -2 in a, b and sigma.
+add_templates = by_image(_templates_by_product, _templates_by_samples)
 
 
 @shared(_nrt=False)

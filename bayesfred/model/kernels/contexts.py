@@ -44,6 +44,7 @@ class Problem(NamedTuple):
     faint: Flags  # (s,) sources for which the term of `expansion.py` counts
     # None where fluxes are fixed: a type of its own, for which what profiles them is not compiled
     free: Literal[True] | None
+    start: Floats  # (s, 3) fluxes and shifts that profiling begins with; without rows if unknown
 
 
 class Workspace(NamedTuple):
@@ -58,6 +59,8 @@ class Workspace(NamedTuple):
     # what profiling fills again on every call, kept because new memory costs more than its use
     heap: Floats
     scratch: Floats  # (5, STRETCH)
+    # images of the gradient, of which the marked segments are made zero before they are used
+    images: tuple[Floats, Floats, Floats, Floats]
 
 
 class Vectors(NamedTuple):
@@ -143,6 +146,7 @@ class Turns(NamedTuple):
 
     turn: Ints
     values: Floats
+    found: Floats  # (rows, s, 3) fluxes and shifts; without rows where they are not wanted
 
 
 @register_jitable

@@ -58,6 +58,14 @@ def render(problem, w, parameters):
     return Rendered(extra + more, geometry, layout.footprints, fluxes, profiled)
 
 
+@inner()
+def _keep(fluxes, profiled, out):
+    """Keep fluxes and shifts."""
+    out[:, 0] = fluxes
+    if profiled is not None:
+        out[:, 1:] = profiled.shifts
+
+
 @entry()
 def log_likelihoods(problem, w, vectors, turns):
     """Log-likelihoods of rows into turns.values; rows where it is -inf already are left alone.
@@ -72,11 +80,14 @@ def log_likelihoods(problem, w, vectors, turns):
             break
         if out[i] > -math.inf:
             parameters = parameters_of(vectors, i)
-            value = render(problem, w, parameters).extra
+            rendered = render(problem, w, parameters)
+            value = rendered.extra
             if value > -math.inf:
                 value += log_likelihood(problem.frame, w, parameters)
             clear(w)
             out[i] = value
+            if turns.found.size > 0:
+                _keep(rendered.fluxes, rendered.profiled, turns.found[i])
 
 
 @entry()

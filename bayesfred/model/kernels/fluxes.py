@@ -67,6 +67,7 @@ from bayesfred.model.kernels.patches import add_patch, fill_excess, new_patch, w
 from bayesfred.model.kernels.shift_modes import other_mode
 
 LONGEST = 8.0  # Newton steps in one
+CLOSE = 1e-16  # square of the distance from the maximum, in standard deviations
 TRIES = 4  # other modes that are looked at in a cluster
 TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
 
@@ -222,6 +223,8 @@ def _maximize(frame, parameters, cluster, h):
         # The square of the distance in standard deviations, and what a step leaves of it: in a
         # Newton step of fluxes alone the square of the largest relative change.
         before, distance = distance, np.dot(gradient, step)
+        if fresh and distance <= CLOSE:
+            return size == 1 or cholesky(h, group)
         for i in range(shares.size):
             own = slice(i * size, (i + 1) * size)
             distances[i] = np.dot(gradient[own], step[own])
@@ -231,7 +234,7 @@ def _maximize(frame, parameters, cluster, h):
         rate = distance / before if before > 0.0 else 1.0
         if fresh and size == 1 and exact:
             rate = largest * largest
-        converged = distance * min(rate, 1.0) <= 1e-16
+        converged = distance * min(rate, 1.0) <= CLOSE
     return False
 
 
@@ -318,6 +321,20 @@ def _climb(frame, parameters, cluster, h):
     return True
 
 
+@inner()
+def _resume(cluster, start):
+    """Templates and image of fluxes and shifts that are known already."""
+    fp, stamps = cluster.layout.footprints, cluster.touching.stamps
+    for s in cluster.group.members:
+        cluster.fluxes[s] = start[s, 0]
+        if stamps.shape[0] > 1:
+            copy(start[s, 1:], cluster.shifts[s])
+            move(cluster.layout.optics, cluster.layout.geometry, s, start[s, 1], start[s, 2])
+        make_templates(cluster, s, start[s, 0])
+        rows = fp.first[s], fp.first[s + 1]
+        add_template(fp, rows, stamps[0], start[s, 0], cluster.canvas)
+
+
 @shared()
 def profile(problem, layout, w, parameters, profiled, fluxes):
     """Fill the fluxes and `profiled` with their maximum; add the sources to the image.
@@ -339,8 +356,11 @@ def profile(problem, layout, w, parameters, profiled, fluxes):
         cluster = Cluster(
             layout, touching, group, patch, canvas, fluxes, shifts, Prior(shape, scatter), scale
         )
-        fill_excess(problem.frame, parameters.background, patch)
-        start(cluster, max(parameters.background[0], 1.0))
+        if problem.start.size > 0:
+            _resume(cluster, problem.start)
+        else:
+            fill_excess(problem.frame, parameters.background, patch)
+            start(cluster, max(parameters.background[0], 1.0))
         if not _climb(problem.frame, parameters, cluster, h):
             return -math.inf
         if np.any(touching.faint[group.members]):

@@ -68,6 +68,7 @@ from bayesfred.model.kernels.likelihood import (
     U,
     add_background_sums,
     background_row,
+    blank,
     log_likelihood,
     next_run,
     unreached_pixels,
@@ -221,10 +222,9 @@ def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
     shape = profiled.shape
     fp, clusters, stamps = touching.footprints, touching.clusters, touching.stamps
     size, pitch = stamps.shape[0], w.image.size // w.span.shape[0]
-    h, y, z = np.zeros(w.image.size), np.zeros(w.image.size), np.empty((flux.size, size))
-    at, mixed = row_starts(fp, pitch), np.zeros(stamps.shape)
+    h, y, z = blank(w, w.images[0]), blank(w, w.images[1]), np.empty((flux.size, size))
+    at, mixed, light = row_starts(fp, pitch), np.zeros(stamps.shape), np.zeros(stamps.shape[1])
     rows = new_rows(layout, _constants(), pitch)
-    light = np.zeros(stamps.shape[1])
     curve = w.weight if response.size == 0 else response
     adjoint = _Adjoint(layout, touching, flux, w.score, w.weight, curve, at, mixed, light, rows)
     prior = Prior(shape, scatter if size > 1 else 0.0)
@@ -280,7 +280,7 @@ _responses = by_exactness(_no_responses, _light_responses)
 
 @inner()
 def _fill_responses(noise, frame, w, background):
-    out, pitch = np.zeros(w.image.size), w.image.size // frame.ny
+    out, pitch = blank(w, w.images[2]), w.image.size // frame.ny
     for j in range(frame.ny):
         c0, c1, c2 = background_row(background, j, frame.ny)
         start, stop = next_run(w, j, w.span[j, 0])
@@ -315,22 +315,24 @@ _images = by_exactness(_exact_images, _light_images)
 @inner()
 def _fill_images(noise, frame, w, background, h, y):
     profiled = h.size > 0
-    light, level, slope = w.score.copy(), np.zeros(w.image.size), 0.0
+    light, level, slope = w.images[0], blank(w, w.images[3]), 0.0  # where h is, too
     pitch = w.image.size // frame.ny
     for j in range(frame.ny):
         c0, c1, c2 = background_row(background, j, frame.ny)
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                more = 0.0
                 if frame.values[p] > LIMIT:
                     u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
                     mu = w.image[p] + c0 + u * (c1 + u * c2)
                     by = error_slopes(noise, frame.values[p], mu, w.image[p], U(p))
                     a, b = (h[p], y[p]) if profiled else (0.0, 0.0)
                     curve = w.weight[p] * w.ratio[p] * a if profiled else 0.0
-                    light[p] += curve + by[0] * b
+                    more = curve + by[0] * b
                     level[p] = by[1] + by[2] * a + by[3] * b
                     slope += by[4] + by[5] * a + by[6] * b
+                light[p] = w.score[p] + more
             start, stop = next_run(w, j, stop)
     return light, level, slope
 
@@ -382,11 +384,9 @@ def gradient(problem, w, rendered, parameters, basis, out):
     layout = layout_of(o, rendered.geometry, fp, parameters.nuisances.psf_sigma)
     wanted = _wanted(rendered.profiled, w)
     weigh_rows(frame, noise, w, (background, (0, o.ny)), wanted[0], wanted[1])
-    scatter = parameters.nuisances.position_scatter
+    scatter, profiled = parameters.nuisances.position_scatter, rendered.profiled
     response = _responses(noise, frame, w, background)
-    z, mixed, h, y, slope = _laplace_adjoint(
-        w, layout, rendered, rendered.profiled, scatter, response
-    )
+    z, mixed, h, y, slope = _laplace_adjoint(w, layout, rendered, profiled, scatter, response)
     image, below, by_error = _images(noise, frame, w, background, h, y)
     add_background_sums(frame, w, below, out[1])
     out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]

@@ -52,7 +52,10 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
     image, score, heap = map(_aligned, (size, size, more))
     weight, ratio = (score, _aligned(0)) if free is None else map(_aligned, (size, size))
     scratch = _aligned(5 * STRETCH).reshape(5, STRETCH)
-    return Workspace(image, flags, span, score, weight, ratio, heap, scratch)
+    one, two, three, four = map(_aligned, (size,) * 4)
+    return Workspace(
+        image, flags, span, score, weight, ratio, heap, scratch, (one, two, three, four)
+    )
 
 
 def _aligned(size: int) -> Floats:
@@ -147,6 +150,15 @@ def clear(w):
             w.image[a * SEGMENT : b * SEGMENT] = 0.0
             w.span[j, 0] = per_row
             w.span[j, 1] = -1
+
+
+@inner()
+def blank(w, image):
+    """Make the marked segments of an image zero, and return it."""
+    for k in range(w.flags.size):
+        if w.flags[k] != 0:
+            image[k * SEGMENT : (k + 1) * SEGMENT] = 0.0
+    return image
 
 
 @leaf()
