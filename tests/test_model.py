@@ -543,6 +543,7 @@ def test_derivatives_begin_with_what_log_prob_found(scatter: bool, model_error: 
     after = dataclasses.replace(fresh)
     after.log_prob(params)
     known = after.likelihood._last.at(params)
+    assert np.array_equal(after.gradient(params), dataclasses.replace(fresh).gradient(params))
     assert known[:, 0] == pytest.approx(fresh.fluxes(params), rel=1e-7)
     assert after.likelihood._last.at(params + 1e-9).size == 0
     sd = np.sqrt(np.diag(np.linalg.inv(fresh.information(params))))

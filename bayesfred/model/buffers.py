@@ -57,13 +57,13 @@ class LastProfiled:
 
     def keep_rendered(self, params: Floats, rendered: Rendered) -> None:
         """Keep what has been rendered."""
-        if self._sources and rendered.profiled and rendered.extra > -np.inf:
+        if rendered.profiled and rendered.extra > -np.inf:
             found = np.column_stack([rendered.fluxes, rendered.profiled.shifts])
             self._known = params.copy(), found
 
-    def forget(self) -> None:
-        """Keep nothing: to the last bit, results then do not depend on what came before."""
-        self._known = np.empty(0), UNKNOWN
+    def missing(self, params: Floats) -> bool:
+        """Whether fluxes are free and not known there."""
+        return self._sources > 0 and not self.at(params).size
 
     def at(self, params: Floats) -> Floats:
         """Shape (s, 3); without rows where they are not known."""

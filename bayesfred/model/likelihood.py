@@ -128,7 +128,6 @@ class FrameLikelihood:
             slow = not self.noise.discrete and hasattr(self._frame.noise, "near")
             fixed = self.nuisances.profiled == 0
             return self._with(Around(params, covariance)) if slow and fixed else self
-        self._last.forget()
         out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
             slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
@@ -156,13 +155,12 @@ class FrameLikelihood:
 
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
-        sources, background = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
-        out = sources, background
+        out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
             slopes, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
         if np.isnan(slopes[0]):
             return np.full(len(self.parameters), np.nan)
-        found = np.concatenate([sources, slopes, background]) @ self._chain_rule(params)
+        found = np.concatenate([out[0], slopes, out[1]]) @ self._chain_rule(params)
         if self.occam:
             found[self._error] += self.occam.slope(params[self._error])
         return np.asarray(found)
@@ -331,11 +329,13 @@ class FrameLikelihood:
     @contextmanager
     def _rendered(self, params: Floats) -> Iterator[tuple[Workspace, Rendered, Parameters]]:
         """A workspace in which the sources are rendered, for one parameter vector."""
-        parameters, start = self._one(params), self._last.at(params)
+        parameters = self._one(params)
         with self._workspaces.one() as w:
-            rendered = render(self._problem._replace(start=start), w, parameters)
-            self._last.keep_rendered(params, rendered)
-            yield w, rendered, parameters
+            if self._last.missing(params):  # first: the same to the last bit whatever came before
+                self._last.keep_rendered(params, render(self._problem, w, parameters))
+                clear(w)
+            problem = self._problem._replace(start=self._last.at(params))
+            yield w, render(problem, w, parameters), parameters
             clear(w)
 
     @cached_property
