@@ -109,6 +109,16 @@ def test_far_from_it_log_prob_is_the_same(case: str) -> None:
         assert extrapolated == pytest.approx(searched, rel=1e-12, abs=ENOUGH)
 
 
+@pytest.mark.parametrize("case", ["touching", "faint"])
+def test_a_vector_by_itself_has_the_log_prob_that_it_has_among_others(case: str) -> None:
+    """Also where nothing is left to search for, and where all is."""
+    _, near, best = solved(case)
+    for sd in (1.0, 100.0):
+        vectors = draws(best, sd)
+        alone = [float(near.log_prob(each)) for each in vectors]
+        assert alone == near.log_prob(vectors).tolist()
+
+
 def test_a_vector_has_the_same_bits_whatever_others_there_are() -> None:
     """A frame's vectors are shared out among any number of workers."""
     random = np.random.default_rng(3)

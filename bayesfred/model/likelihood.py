@@ -103,10 +103,10 @@ class FrameLikelihood:
             self._evaluate(kernel, arguments, out, UNKNOWN[None])
             rows = np.flatnonzero(np.isnan(out))
         left = np.nan_to_num(out[rows], neginf=-np.inf)
-        found = self._last.room(vectors)
+        found = self._last.room(vectors[rows])
         self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left, found)
         out[rows] = left
-        self._last.keep(vectors, left, found)
+        self._last.keep(vectors[rows], left, found)
         if self.occam:
             there = out > -np.inf
             out[there] += self.occam.log(vectors[there, self._error])
