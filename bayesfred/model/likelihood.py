@@ -22,13 +22,12 @@ from bayesfred.model.buffers import UNKNOWN, LastProfiled, Workspaces
 from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.contexts import (
+    Evaluation,
     Frame,
     Parameters,
     Problem,
-    Rendered,
     Turns,
     Vectors,
-    Workspace,
     parameters_of,
 )
 from bayesfred.model.kernels.evaluate import extrapolated_log_likelihoods, log_likelihoods, render
@@ -98,8 +97,8 @@ class FrameLikelihood:
         out = np.where(wanted, 0.0, -np.inf)
         arguments, rows = self._arguments(vectors), np.arange(len(vectors))
         if isinstance(self.extrapolation, FluxExtrapolation):
-            known = {"extrapolated": self.extrapolation.at(vectors)}
-            kernel = partial(extrapolated_log_likelihoods, **known)
+            known = self.extrapolation.at(vectors)
+            kernel = partial(extrapolated_log_likelihoods, extrapolated=known)
             self._evaluate(kernel, arguments, out, UNKNOWN[None])
             rows = np.flatnonzero(np.isnan(out))
         left = np.nan_to_num(out[rows], neginf=-np.inf)
@@ -201,7 +200,7 @@ class FrameLikelihood:
     def expected(self, params: Floats) -> Iterator[Expected]:
         """Expected counts in the memory where they are rendered, which then serves others again."""
         ny, nx = self.model.detector.shape
-        with self._rendered(params) as (w, rendered, parameters):
+        with self._rendered(params, to_the_bit=False) as (w, rendered, parameters):
             bad = 0.0 if rendered.extra > -np.inf else np.nan
             level = polynomial_background(self.mask.shape, parameters.background + bad)
             yield Expected(w.image.reshape(ny, -1)[:, :nx], level, rendered.fluxes + bad)
@@ -327,11 +326,11 @@ class FrameLikelihood:
         return chain_rule(self.parameters, params, self.model.polynomial, self._moving)
 
     @contextmanager
-    def _rendered(self, params: Floats) -> Iterator[tuple[Workspace, Rendered, Parameters]]:
+    def _rendered(self, params: Floats, to_the_bit: bool = True) -> Iterator[Evaluation]:
         """A workspace in which the sources are rendered, for one parameter vector."""
         parameters = self._one(params)
         with self._workspaces.one() as w:
-            if self._last.missing(params):  # first: the same to the last bit whatever came before
+            if to_the_bit and self._last.missing(params):  # the same whatever came before
                 self._last.keep_rendered(params, render(self._problem, w, parameters))
                 clear(w)
             problem = self._problem._replace(start=self._last.at(params))

@@ -133,6 +133,9 @@ class Rendered(NamedTuple):
     profiled: Profiled | None  # None where fluxes are fixed
 
 
+Evaluation = tuple[Workspace, Rendered, Parameters]  # of one parameter vector
+
+
 class Unreached(NamedTuple):
     """The pixels in the likelihood that no source reaches: those of segments whose flag is 0."""
 
