@@ -13,12 +13,18 @@ from bayesfred.analysis import source_tests
 from bayesfred.analysis.checks import largest_deviate
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.residuals import Residuals, judge_residuals
-from bayesfred.analysis.score_tests import ScoreTests, _with_more_terms, score_tests
+from bayesfred.analysis.score_tests import (
+    FALSE_ALARM,
+    ScoreTests,
+    _with_more_terms,
+    score_tests,
+)
 from bayesfred.analysis.verdict import FitVerdict, judge_fit
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.monomials import degree_of
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, GaussianNoise, PoissonNoise
 from bayesfred.model.parameters import Nuisances
@@ -263,6 +269,18 @@ def flagged(name: str, seeds: range) -> tuple[int, int, int]:
         named += bool(verdict.causes) and verdict.causes[0].name == cause
         seen += not passed
     return found, named, seen
+
+
+def test_limits_share_the_level_out() -> None:
+    """All of it, and of the terms of the highest degree so little that the others lose nothing."""
+    posterior = missing_terms(0)
+    tests = score_tests(posterior, find_map(posterior).params)
+    chance = np.where(tests.tested, 2.0 * stats.norm.sf(tests.limits), 0.0)
+    assert chance.sum() == pytest.approx(FALSE_ALARM, rel=1e-9)
+    fourth = np.array([degree_of(name) == 4 and name[1] == "_" for name in tests.names])
+    assert fourth.sum() == 10 and np.all(tests.limits[fourth] > 4.2)
+    alone = stats.norm.isf(0.5 * FALSE_ALARM / np.sum(tests.tested & ~fourth))
+    assert tests.limits[~fourth] == pytest.approx(alone, abs=0.01)
 
 
 @pytest.mark.parametrize("name", HIDDEN)
