@@ -7,9 +7,21 @@ from contextlib import contextmanager
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.model.kernels.contexts import Rendered, Workspace
+from bayesfred.model.kernels.contexts import Known, Nearby, Rendered, Turns, Workspace
 
 UNKNOWN = np.empty((0, 3))
+NOTHING = Known(UNKNOWN, Nearby(UNKNOWN, np.empty(0), UNKNOWN))
+
+
+def new_turns(
+    values: Floats,
+    found: Floats = UNKNOWN[None],
+    start: Floats | None = None,
+    nearby: Nearby = NOTHING.nearby,
+) -> Turns:
+    """Rows for threads to share, see `Turns`."""
+    start = np.empty((len(values), *UNKNOWN.shape)) if start is None else start
+    return Turns(np.zeros(1, np.int64), values, found, start, nearby)
 
 
 class Workspaces:

@@ -1,21 +1,27 @@
-"""Where free fluxes have their maximum, extrapolated from one parameter vector.
+"""Where fluxes and shifts have their maximum, extrapolated from one parameter vector.
 
-The most likely fluxes are a smooth function of the other parameters. Within a posterior's width it
-is nearly linear: what its secants leave is little enough for one Newton step, see
-`kernels/extrapolate.py`.
+The most likely ones are a smooth function of the other parameters. Within a posterior's width it is
+nearly linear: what its secants leave is little enough for one Newton step of fluxes, see
+`kernels/extrapolate.py`, and for two or three of fluxes and shifts, see `kernels/fluxes.py`.
 """
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.model.kernels.contexts import Clusters, Rendered
+from bayesfred.model.buffers import new_turns
+from bayesfred.model.kernels.contexts import Clusters, Nearby, Rendered, Turns
+from bayesfred.model.kernels.evaluate import extrapolated_log_likelihoods, log_likelihoods
 from bayesfred.model.kernels.extrapolate import Extrapolated, describe
-from bayesfred.model.near_mean import whitening
+from bayesfred.model.near_mean import FARTHER, whitening
+
+LEAST = 0.1  # of a flux nearby, that it is taken to have at least
 
 
 class FluxExtrapolation(NamedTuple):
@@ -34,28 +40,64 @@ class FluxExtrapolation(NamedTuple):
         moved = np.einsum("nd,sd->ns", vectors - self.params, self.slope)
         return Extrapolated(self.fluxes + moved, self.clusters, *self.hessian)
 
+    def work(self, vectors: Floats, out: Floats) -> tuple[Callable[..., Any], Turns]:
+        """What evaluates log-likelihoods of vectors into `out`; it leaves NaN where it fails."""
+        kernel = partial(extrapolated_log_likelihoods, extrapolated=self.at(vectors))
+        return kernel, new_turns(out)
 
-def flux_extrapolation(
+
+class ShiftExtrapolation(NamedTuple):
+    """Most likely fluxes and shifts as a linear function of the parameters."""
+
+    model: ForwardModel  # whose sources these are
+    params: Floats  # (d,)
+    whitened: Floats  # (d, d) times a vector less `params`: in standard deviations
+    found: Floats  # (s, 3) there
+    slope: Floats  # (s, 3, d)
+    nearby: Nearby
+
+    def work(self, vectors: Floats, out: Floats) -> tuple[Callable[..., Any], Turns]:
+        """What evaluates log-likelihoods of vectors into `out`; NaN where they are far away."""
+        moved = vectors - self.params
+        distance = np.sqrt(np.sum(np.einsum("nd,kd->nk", moved, self.whitened) ** 2, axis=1))
+        out[(distance > math.sqrt(self.params.size) + FARTHER) & (out > -np.inf)] = np.nan
+        start = self.found + np.einsum("nd,std->nst", moved, self.slope)
+        start[..., 0] = np.maximum(start[..., 0], LEAST * self.found[:, 0])
+        return log_likelihoods, new_turns(out, start=start, nearby=self.nearby)
+
+
+Extrapolation = FluxExtrapolation | ShiftExtrapolation
+
+
+def extrapolate(
     model: ForwardModel,
-    fluxes_at: Callable[[Floats], Floats],
+    found_at: Callable[[Floats], Floats],
     rendered: Rendered,
-    z: Floats,
-    params: Floats,
-    covariance: Floats,
-) -> FluxExtrapolation | None:
-    """From the fluxes at `params` and a standard deviation to either side along whitened axes.
+    nearby: Nearby,
+    around: tuple[Floats, Floats],
+) -> Extrapolation | None:
+    """From fluxes and shifts at some parameters and a standard deviation to either side of them.
 
-    Along axes on which there are none, because the map folds or the background ends, they are taken
-    as constant. z is that of `kernels/gradient.py`. Without a covariance there is no extrapolation.
+    That is along whitened axes. `around` are the parameters and a covariance. There is no
+    extrapolation without one, or where the likelihood is zero. `found_at` gives fluxes and shifts
+    of n vectors, shape (n, s, 3), NaN where the map folds or the background ends; from there on
+    they are taken as constant.
     """
+    (params, covariance), profiled, fluxes = around, rendered.profiled, rendered.fluxes
     axes = whitening(covariance)
-    if axes is None:
+    if axes is None or not nearby.e.size:
         return None
-    change = np.stack(
-        [0.5 * (fluxes_at(params + axis) - fluxes_at(params - axis)) for axis in axes.T], axis=1
-    )
-    slope = linalg.solve_triangular(axes, np.nan_to_num(change).T, trans="T", lower=True).T
-    profiled, fluxes = rendered.profiled, rendered.fluxes
     assert profiled is not None
-    hessian = describe(profiled, fluxes, z)
-    return FluxExtrapolation(model, params, fluxes, slope, profiled.touching.clusters, hessian)
+    here = np.column_stack([fluxes, profiled.shifts])
+    sides = found_at(params + np.concatenate([axes.T, -axes.T])) - here
+    known = np.isfinite(sides[:, 0, 0]).reshape(2, -1)
+    change = np.nan_to_num(sides).reshape(2, len(axes), -1)
+    change = (change[0] - change[1]) / np.maximum(known.sum(axis=0), 1)[:, None]
+    slope = linalg.solve_triangular(axes, change, trans="T", lower=True).T
+    if nearby.e.shape[1] == 1:
+        by_flux, clusters = np.ascontiguousarray(slope[::3]), profiled.touching.clusters
+        hessian = describe(profiled, fluxes, nearby.e[:, 0])
+        return FluxExtrapolation(model, params, fluxes, by_flux, clusters, hessian)
+    whitened = linalg.solve_triangular(axes, np.eye(len(axes)), lower=True)
+    slope = np.ascontiguousarray(slope.reshape(len(here), 3, -1))
+    return ShiftExtrapolation(model, params, whitened, here, slope, nearby)

@@ -18,8 +18,8 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import Basis, Optics, stride
 from bayesfred.imaging.kernels.render import render as render_sources
-from bayesfred.model.buffers import UNKNOWN, LastProfiled, Workspaces
-from bayesfred.model.extrapolation import FluxExtrapolation, flux_extrapolation
+from bayesfred.model.buffers import NOTHING, LastProfiled, Workspaces, new_turns
+from bayesfred.model.extrapolation import Extrapolation, extrapolate
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.kernels.contexts import (
     Evaluation,
@@ -30,7 +30,7 @@ from bayesfred.model.kernels.contexts import (
     Vectors,
     parameters_of,
 )
-from bayesfred.model.kernels.evaluate import extrapolated_log_likelihoods, log_likelihoods, render
+from bayesfred.model.kernels.evaluate import log_likelihoods, render
 from bayesfred.model.kernels.fisher import fisher
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
@@ -73,7 +73,7 @@ class FrameLikelihood:
         The table, in the order of every parameter vector.
     narrowest : float, optional, pixel
         Width of the narrowest PSF for which pixels have to be integrated well.
-    extrapolation : FluxExtrapolation or Around, optional
+    extrapolation : FluxExtrapolation, ShiftExtrapolation or Around, optional
         What `near` knows of the parameters around which the likelihood is evaluated.
     occam : OccamFactor, optional
         What a PSF that was measured on the frame says of the model error.
@@ -86,7 +86,7 @@ class FrameLikelihood:
     nuisances: Nuisances
     parameters: tuple[Parameter, ...]
     narrowest: float | None = None
-    extrapolation: FluxExtrapolation | Around | None = None
+    extrapolation: Extrapolation | Around | None = None
     occam: OccamFactor | None = None
 
     def log_likelihood(self, vectors: Floats, wanted: Flags) -> Floats:
@@ -96,14 +96,13 @@ class FrameLikelihood:
         """
         out = np.where(wanted, 0.0, -np.inf)
         arguments, rows = self._arguments(vectors), np.arange(len(vectors))
-        if isinstance(self.extrapolation, FluxExtrapolation):
-            known = self.extrapolation.at(vectors)
-            kernel = partial(extrapolated_log_likelihoods, extrapolated=known)
-            self._evaluate(kernel, arguments, out, UNKNOWN[None])
+        if isinstance(self.extrapolation, Extrapolation):
+            self._evaluate(arguments, *self.extrapolation.work(vectors, out))
             rows = np.flatnonzero(np.isnan(out))
         left = np.nan_to_num(out[rows], neginf=-np.inf)
         found = self._last.room(vectors[rows])
-        self._evaluate(log_likelihoods, Vectors(*(each[rows] for each in arguments)), left, found)
+        some = Vectors(*(each[rows] for each in arguments))
+        self._evaluate(some, log_likelihoods, new_turns(left, found))
         out[rows] = left
         self._last.keep(vectors[rows], left, found)
         if self.occam:
@@ -111,31 +110,35 @@ class FrameLikelihood:
             out[there] += self.occam.log(vectors[there, self._error])
         return out + self._constant
 
-    def _evaluate(self, kernel: Any, vectors: Vectors, out: Floats, found: Floats) -> None:
-        problem, turns = self.near_problem, Turns(np.zeros(1, np.int64), out, found)
+    def _evaluate(self, vectors: Vectors, kernel: Any, turns: Turns) -> None:
+        problem = self.near_problem
 
         def work() -> None:
             with self._workspaces.one() as w:
                 kernel(problem, w, vectors, turns=turns)
 
-        if out.size:  # what nothing needs is not compiled
-            share(work, len(out))
+        if turns.values.size:  # what nothing needs is not compiled
+            share(work, len(turns.values))
+
+    def _found(self, vectors: Floats) -> Floats:
+        """Fluxes and shifts of all sources for n vectors, shape (n, s, 3); NaN without any."""
+        out, found = np.zeros(len(vectors)), np.empty((len(vectors), len(self.model.sources), 3))
+        self._evaluate(self._arguments(vectors), log_likelihoods, new_turns(out, found))
+        found[out == -np.inf] = np.nan
+        return found
 
     def near(self, params: Floats, covariance: Floats) -> "FrameLikelihood":
         """The same likelihood, faster to evaluate around `params`: see `Posterior.near`."""
-        if self.nuisances.profiled != 1:
+        if not self._free:
             slow = not self.noise.discrete and hasattr(self._frame.noise, "near")
-            fixed = self.nuisances.profiled == 0
-            return self._with(Around(params, covariance)) if slow and fixed else self
+            return self._with(Around(params, covariance)) if slow else self
         out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
-            slopes, z = gradient(self._problem, w, rendered, parameters, self._basis, out)
-        if not np.isfinite(slopes[0]):
-            return replace(self, extrapolation=None)
-        known = flux_extrapolation(self.model, self.fluxes, rendered, z[:, 0], params, covariance)
+            _, nearby = gradient(self._problem, w, rendered, parameters, self._basis, out)
+        known = extrapolate(self.model, self._found, rendered, nearby, (params, covariance))
         return self._with(known)
 
-    def _with(self, extrapolation: FluxExtrapolation | Around | None) -> "FrameLikelihood":
+    def _with(self, extrapolation: Extrapolation | Around | None) -> "FrameLikelihood":
         close = replace(self, extrapolation=extrapolation)
         vars(close).update((k, made) for k, made in vars(self).items() if k[0] == "_")  # large
         return close
@@ -148,9 +151,8 @@ class FrameLikelihood:
 
     def share_frame(self, other: "FrameLikelihood") -> None:
         """Use what another made of the same counts and noise: series of the noise take long."""
-        varies = self.nuisances.background_order > 0
-        everywhere = varies or other._frame.everywhere
-        vars(self)["_frame"] = other._frame._replace(varies=varies, everywhere=everywhere)
+        varies, frame = self.nuisances.background_order > 0, other._frame
+        vars(self)["_frame"] = frame._replace(varies=varies, everywhere=varies or frame.everywhere)
 
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
@@ -172,8 +174,7 @@ class FrameLikelihood:
             known = fisher(self._problem, w, rendered, parameters, self._basis, others)
         if np.isnan(known[0]):
             return np.full((len(self.parameters),) * 2, np.nan)
-        # scatter and model error are independent of the others: the size of shifts and residuals
-        # tells of them
+        # the size of shifts and residuals tells of scatter and model error, whatever the others
         apart, size = len(SCALES), sources + len(SCALES) + len(BACKGROUND_TERMS)
         out = np.zeros((size, size))
         index = [*range(sources), *range(sources + apart, sources + apart + terms)]
@@ -331,10 +332,10 @@ class FrameLikelihood:
         parameters = self._one(params)
         with self._workspaces.one() as w:
             if to_the_bit and self._last.missing(params):  # the same whatever came before
-                self._last.keep_rendered(params, render(self._problem, w, parameters))
+                self._last.keep_rendered(params, render(self._problem, w, parameters, NOTHING))
                 clear(w)
-            problem = self._problem._replace(start=self._last.at(params))
-            yield w, render(problem, w, parameters), parameters
+            known = NOTHING._replace(start=self._last.at(params))
+            yield w, render(self._problem, w, parameters, known), parameters
             clear(w)
 
     @cached_property
@@ -378,7 +379,7 @@ class FrameLikelihood:
     @cached_property
     def _problem(self) -> Problem:
         flux, shape = self.model.sources.flux, self.nuisances.flux_shape
-        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free, UNKNOWN)
+        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free)
 
     @cached_property
     def near_problem(self) -> Problem:

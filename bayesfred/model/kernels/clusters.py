@@ -252,14 +252,15 @@ def add_prior(h, group, prior, fluxes, shifts, share):
 def add_block(i, start, out, block):
     """Add second derivatives to a source's own block of a matrix.
 
-    The block is (F dx, F dy, dx dx, dx dy, dy dy).
+    The block is (F F, F dx, F dy, dx dx, dx dy, dy dy).
     """
-    row, column = start[3 * i + 1 : 3 * i + 3], 3 * i
+    row, column = start[3 * i : 3 * i + 3], 3 * i
     out[row[0] + column] += block[0]
     out[row[1] + column] += block[1]
-    out[row[0] + column + 1] += block[2]
+    out[row[2] + column] += block[2]
     out[row[1] + column + 1] += block[3]
-    out[row[1] + column + 2] += block[4]
+    out[row[2] + column + 1] += block[4]
+    out[row[2] + column + 2] += block[5]
 
 
 @leaf(fastmath=REDUCE)

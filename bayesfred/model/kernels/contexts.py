@@ -44,7 +44,21 @@ class Problem(NamedTuple):
     faint: Flags  # (s,) sources for which the term of `expansion.py` counts
     # None where fluxes are fixed: a type of its own, for which what profiles them is not compiled
     free: Literal[True] | None
-    start: Floats  # (s, 3) fluxes and shifts that profiling begins with; without rows if unknown
+
+
+class Nearby(NamedTuple):
+    """Numbers of `gradient.py` at other parameters, with which a search ends early."""
+
+    e: Floats  # (s, templates) but for the prior's k'
+    spread: Floats  # (s,) Q_11 + Q_22
+    bends: Floats  # (s, 6) blocks of G - H, but for the prior's
+
+
+class Known(NamedTuple):
+    """What is known of fluxes and shifts before their maximum is looked for; no rows: nothing."""
+
+    start: Floats  # (s, 3) where the search begins
+    nearby: Nearby
 
 
 class Workspace(NamedTuple):
@@ -117,6 +131,7 @@ class Profiled(NamedTuple):
 
     touching: Touching
     factors: Floats  # Cholesky factors of H
+    fluxes: Floats  # (s,) counts
     shifts: Floats  # (s, 2) pixel
     shape: float  # of the fluxes' Gamma prior
 
@@ -149,7 +164,9 @@ class Turns(NamedTuple):
 
     turn: Ints
     values: Floats
-    found: Floats  # (rows, s, 3) fluxes and shifts; without rows where they are not wanted
+    found: Floats  # (rows, s, 3) fluxes and shifts; of no source where they are not wanted
+    start: Floats  # (rows, s, 3) with `nearby`: see `Known`
+    nearby: Nearby
 
 
 @register_jitable

@@ -10,37 +10,37 @@ from bayesfred.imaging.kernels.fastmath import take_turn
 from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, row_starts
 from bayesfred.imaging.kernels.render import add_sources
 from bayesfred.model.kernels.clusters import bounding_boxes, find_clusters
-from bayesfred.model.kernels.contexts import Profiled, Rendered, Touching, parameters_of
+from bayesfred.model.kernels.contexts import Known, Profiled, Rendered, Touching, parameters_of
 from bayesfred.model.kernels.extrapolate import profile_extrapolated
 from bayesfred.model.kernels.fluxes import profile
 from bayesfred.model.kernels.likelihood import clear, log_likelihood, mark, room
 
 
 @inner()
-def _fill_fluxes(problem, layout, w, parameters, fluxes, free):
+def _fill_image(problem, layout, w, parameters, known, free):
     """Add the sources to the image, their fluxes at their maximum if they are free.
 
-    Returns what profiling adds to the log-likelihood, and what the derivatives need of it.
+    Returns what profiling adds to the log-likelihood, the fluxes, and what the derivatives need.
     """
-    o, fp = layout.optics, layout.footprints
+    o, fp, fluxes = layout.optics, layout.footprints, np.empty(problem.flux.size)
     if free is None:
         canvas = Canvas(w.image, row_starts(fp, w.image.size // o.ny))
         for s in range(fluxes.size):
             fluxes[s] = parameters.nuisances.flux_scale * problem.flux[s]
         add_sources(layout, fluxes, canvas)
-        return 0.0, None
+        return 0.0, fluxes, None
     templates = 3 if parameters.nuisances.position_scatter > 0.0 else 1
     boxes = bounding_boxes(fp)
     clusters = find_clusters(boxes, o.ny, templates)
     stamps = room(w, w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
     touching = Touching(fp, boxes, clusters, stamps, problem.faint)
     factors, shifts = np.empty(clusters.begin[-1]), np.zeros((fluxes.size, 2))
-    profiled = Profiled(touching, factors, shifts, problem.shape)
-    return profile(problem, layout, w, parameters, profiled, fluxes), profiled
+    profiled = Profiled(touching, factors, fluxes, shifts, problem.shape)
+    return profile(problem, layout, w, parameters, known, profiled), fluxes, profiled
 
 
 @entry()
-def render(problem, w, parameters):
+def render(problem, w, parameters, known):
     """Render all sources, profiling their fluxes if they are free.
 
     The caller clears the workspace.
@@ -53,8 +53,7 @@ def render(problem, w, parameters):
         geometry.rows[:] = 0
     layout = lay_out(o, geometry, nuisances.psf_sigma)
     mark(problem.frame, layout.footprints, w)
-    fluxes = np.empty(problem.flux.size)
-    more, profiled = _fill_fluxes(problem, layout, w, parameters, fluxes, problem.free)
+    more, fluxes, profiled = _fill_image(problem, layout, w, parameters, known, problem.free)
     return Rendered(extra + more, geometry, layout.footprints, fluxes, profiled)
 
 
@@ -68,7 +67,7 @@ def _keep(fluxes, profiled, out):
 
 @entry()
 def log_likelihoods(problem, w, vectors, turns):
-    """Log-likelihoods of rows into turns.values; rows where it is -inf already are left alone.
+    """Log-likelihoods of rows into turns.values; rows where it is -inf or NaN are left alone.
 
     Each row is whose turn it is: threads that share `turns` share the rows, and one that is held up
     takes fewer.
@@ -80,7 +79,8 @@ def log_likelihoods(problem, w, vectors, turns):
             break
         if out[i] > -math.inf:
             parameters = parameters_of(vectors, i)
-            rendered = render(problem, w, parameters)
+            known = Known(turns.start[i], turns.nearby)
+            rendered = render(problem, w, parameters, known)
             value = rendered.extra
             if value > -math.inf:
                 value += log_likelihood(problem.frame, w, parameters)

@@ -9,7 +9,7 @@ Hessian, and d = H^-1 g the Newton step. Then
 
 and 1/2 log det H differs from its value at the maximum by sum_s b_s d_s + O(d^2), |b_s| being less
 than one or so: on a source's pixels mu changes by no more than d_s mu, and H by twice as much. b is
-known from other parameters nearby; it is -F e with the e of `gradient.py`, which is H z. Where D =
+known from other parameters nearby; it is -F e with the e of `gradient.py`. Where D =
 sum_s |d_s| is little, the pixels need to be visited once. They are visited in bands of rows, whose
 templates stay in the caches while they are rendered, weighed and multiplied. The term c of
 `expansion.py` is that of F: it changes by less than d.
@@ -66,11 +66,11 @@ class _Visit(NamedTuple):
 
 
 @entry()
-def describe(profiled, fluxes, z):
-    """`diagonal` to `slope` of `Extrapolated`, from H's Cholesky factors and z nearby."""
+def describe(profiled, fluxes, e):
+    """`diagonal` to `slope` of `Extrapolated`, from H's Cholesky factors and e nearby."""
     clusters, factors, size = profiled.touching.clusters, profiled.factors, fluxes.size
     diagonal, first = np.empty(size, np.int64), np.empty(size, np.int64)
-    last, slope = np.empty(size, np.int64), np.zeros(size)
+    last, slope = np.empty(size, np.int64), -fluxes * e
     other, place = np.empty(factors.size, np.int64), np.empty(factors.size, np.int64)
     n = 0
     for c in range(clusters.first.size - 1):
@@ -87,11 +87,9 @@ def describe(profiled, fluxes, z):
                 h = 0.0
                 for m in range(max(lead[i], lead[k]), k + 1):
                     h += lower[start[i] + m] * lower[start[k] + m]
-                slope[s] -= h * z[t] * fluxes[s]
                 if k == i:
                     norm[i] = math.sqrt(h)
                     continue
-                slope[t] -= h * z[s] * fluxes[t]
                 if abs(h) > OVERLAP * norm[i] * norm[k]:
                     other[n], place[n] = t, begin + start[i] + k
                     n += 1

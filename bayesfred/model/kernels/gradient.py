@@ -42,28 +42,11 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner, leaf
-from bayesfred.imaging.kernels.contexts import SEGMENT, Basis, Canvas, Layout
+from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.geometry import layout_of, row_starts
-from bayesfred.imaging.kernels.jacobian import Rows, new_rows, second_derivatives
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
-from bayesfred.model.kernels.clusters import (
-    DOF,
-    SHARE,
-    Prior,
-    add_block,
-    add_prior,
-    add_template,
-    bend_prior,
-    cholesky,
-    gram,
-    invert,
-    one_cluster,
-    shift_prior,
-    solve,
-    touch,
-)
-from bayesfred.model.kernels.contexts import LIMIT, Touching
-from bayesfred.model.kernels.expansion import Pixels, add_slopes, expand
+from bayesfred.model.kernels.contexts import LIMIT, Nearby
+from bayesfred.model.kernels.laplace import laplace_adjoint
 from bayesfred.model.kernels.likelihood import (
     U,
     add_background_sums,
@@ -91,171 +74,6 @@ class _Amplitudes(NamedTuple):
     mixed: Floats  # the templates q = Q T; without samples where fluxes are fixed
     image: Floats  # A
     at: Ints  # where the footprints' rows begin in the padded frame
-
-
-class _Adjoint(NamedTuple):
-    """What the derivative of the Laplace term is made of."""
-
-    layout: Layout
-    touching: Touching
-    fluxes: Floats
-    score: Floats
-    weight: Floats
-    response: Floats  # -dr/dmu
-    at: Ints  # where the footprints' rows begin in the padded frame
-    mixed: Floats  # the templates q = Q T
-    light: Floats  # (samples,) dc/dT over W
-    rows: Rows
-
-
-@inner()
-def _constants():
-    """The basis of the monomial 1: its rows are -dT/d dx, -dT/d dy, T and dT/dsigma of T."""
-    one = np.zeros((1, 2), np.int64)
-    return Basis(one, one, np.empty(0, np.int64), np.empty((0, 0)))
-
-
-@leaf()
-def _add_mixed(touching, s, t, column, out):
-    """Add sum_b column[b] T_b of source t, where it overlaps source s, to out, a template of s."""
-    fp, boxes, stamps = touching.footprints, touching.boxes, touching.stamps
-    firsts, lows, sizes, starts = fp.first, fp.low, fp.size, fp.start
-    for j in range(max(boxes[s, 0], boxes[t, 0]), min(boxes[s, 1], boxes[t, 1])):
-        p = firsts[s] + j - boxes[s, 0]
-        q = firsts[t] + j - boxes[t, 0]
-        first = max(lows[p], lows[q])
-        last = min(lows[p] + sizes[p], lows[q] + sizes[q])
-        ps, qs = starts[p] - lows[p], starts[q] - lows[q]
-        for b in range(stamps.shape[0]):
-            for k in range(first, last):
-                out[ps + k] += column[b] * stamps[b, qs + k]
-
-
-@inner()
-def _mix(adjoint, group, lower):
-    """Add a cluster's q = Q T to `mixed`; returns the diagonal of Q."""
-    boxes, members, mixed = adjoint.touching.boxes, group.members, adjoint.mixed
-    lead, start, touching, size = group.lead, group.start, adjoint.touching, mixed.shape[0]
-    q, column, diagonal = invert(lower, group), np.empty(size), np.empty(lead.size)
-    for i in range(lead.size):
-        s = members[i // size]
-        diagonal[i] = q[start[i] + i]
-        for m in range(lead[i] // size, members.size):
-            t = members[m]
-            if boxes[t, 0] >= boxes[s, 1]:
-                break
-            if touch(boxes, s, t):
-                for b in range(size):
-                    k = m * size + b
-                    column[b] = q[start[max(i, k)] + min(i, k)]
-                _add_mixed(touching, s, t, column, mixed[i % size])
-    return diagonal
-
-
-@inner()
-def _second_derivatives(adjoint, group, i, part, g):
-    """Add what a source's K_xx, K_xy, K_yy, and X, Y as dK, give to its rows of e and G."""
-    fp, stamps, mixed = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.mixed
-    ats, score, weights, s = adjoint.at, adjoint.score, adjoint.weight, group.members[i]
-    starts, sizes, flux = fp.start, fp.size, adjoint.fluxes[s]
-    second = second_derivatives(adjoint.layout, adjoint.rows, s, flux)
-    for p in range(fp.first[s], fp.first[s + 1]):
-        begin = starts[p] - starts[fp.first[s]]
-        for k in range(sizes[p]):
-            at, pixel, own = starts[p] + k, ats[p] + k, begin + k
-            xx, xy, yy = second[0, own], second[1, own], second[2, own]
-            x, y = stamps[1, at] / flux, stamps[2, at] / flux
-            r, weight = score[pixel], weights[pixel]
-            q0, q1, q2 = mixed[0, at], mixed[1, at], mixed[2, at]
-            part[0] -= weight * (q1 * x + q2 * y)
-            part[1] -= weight * (q0 * x + q1 * xx + q2 * xy)
-            part[2] -= weight * (q0 * y + q1 * xy + q2 * yy)
-            add_block(i, group.start, g, (-r * x, -r * y, -r * xx, -r * xy, -r * yy))
-
-
-@inner()
-def _fill_part(adjoint, group, shape, ratio, h, part):
-    """Fill e with a cluster's sums over pixels, h and q including what the term c adds to them."""
-    fp, stamps, at = adjoint.touching.footprints, adjoint.touching.stamps, adjoint.at
-    size, mixed, members, fluxes = stamps.shape[0], adjoint.mixed, group.members, adjoint.fluxes
-    first, starts, sizes = fp.first, fp.start, fp.size
-    for s in members:
-        for p in range(first[s], first[s + 1]):
-            for t in range(size):
-                for k in range(sizes[p]):
-                    h[at[p] + k] += stamps[t, starts[p] + k] * mixed[t, starts[p] + k]
-    pixels, light = Pixels(adjoint.weight, ratio, at), adjoint.light
-    _, slopes = expand(adjoint.touching, group, fluxes, shape, pixels)
-    add_slopes(adjoint.touching, group, fluxes, pixels, slopes, (h, light))
-    for i in range(part.size):
-        s, t = members[i // size], i % size
-        part[i] = 0.0
-        for p in range(first[s], first[s + 1]):
-            for k in range(sizes[p]):
-                pixel, own = at[p] + k, starts[p] + k
-                change = ratio[pixel] * h[pixel] + (light[own] if t == 0 else 0.0)
-                part[i] += adjoint.weight[pixel] * change * stamps[t, own]
-                if t == 0:
-                    mixed[0, own] -= fluxes[s] * light[own]
-
-
-@inner()
-def _hessian(adjoint, group, prior, shifts, part, lower):
-    """Cholesky's factor of G; it is positive definite at a maximum, elsewhere H has to do."""
-    size, g = adjoint.mixed.shape[0], np.empty(lower.size)
-    gram(adjoint.touching, group, adjoint.response, adjoint.at, g)
-    add_prior(g, group, prior, adjoint.fluxes, shifts, SHARE)
-    for i in range(group.members.size if size > 1 else 0):
-        _second_derivatives(adjoint, group, i, part[i * size : (i + 1) * size], g)
-        xx, xy, yy = bend_prior(shifts[group.members[i]], prior.scatter)
-        add_block(i, group.start, g, (0.0, 0.0, xx, xy, yy))
-    return g if cholesky(g, group) else lower
-
-
-@inner()
-def _laplace_adjoint(w, layout, rendered, profiled, scatter, response):
-    """z, the templates q, the images h and y and the derivative by tau of the derivation."""
-    if profiled is None:
-        none = np.empty(0)
-        return np.zeros((rendered.fluxes.size, 1)), np.empty((1, 0)), none, none, 0.0
-    touching, flux, shift = profiled.touching, rendered.fluxes, profiled.shifts
-    shape = profiled.shape
-    fp, clusters, stamps = touching.footprints, touching.clusters, touching.stamps
-    size, pitch = stamps.shape[0], w.image.size // w.span.shape[0]
-    h, y, z = blank(w, w.images[0]), blank(w, w.images[1]), np.empty((flux.size, size))
-    at, mixed, light = row_starts(fp, pitch), np.zeros(stamps.shape), np.zeros(stamps.shape[1])
-    rows = new_rows(layout, _constants(), pitch)
-    curve = w.weight if response.size == 0 else response
-    adjoint = _Adjoint(layout, touching, flux, w.score, w.weight, curve, at, mixed, light, rows)
-    prior = Prior(shape, scatter if size > 1 else 0.0)
-    slope = 0.0
-    for c in range(clusters.first.size - 1):
-        group = one_cluster(clusters, c, size)
-        lower = profiled.factors[clusters.begin[c] : clusters.begin[c + 1]]
-        diagonal = _mix(adjoint, group, lower)
-        part = np.empty(diagonal.size)
-        _fill_part(adjoint, group, shape, w.ratio, h, part)
-        for i in range(0, part.size, size):
-            own = flux[group.members[i // size]]
-            part[i] += shape * diagonal[i] / own**3 - 1.0 / own
-            if size > 1:
-                ratio, k = shift_prior(shift[group.members[i // size]], scatter)
-                more = (diagonal[i + 1] + diagonal[i + 2]) * SHARE * k
-                more /= DOF * scatter**2 * (1.0 + ratio)
-                part[i + 1] += more * shift[group.members[i // size], 0]
-                part[i + 2] += more * shift[group.members[i // size], 1]
-        if size > 1 or response.size > 0:
-            lower = _hessian(adjoint, group, prior, shift, part, lower)
-        solve(lower, group, part)
-        for i in range(part.size):
-            s, t = group.members[i // size], i % size
-            z[s, t] = part[i]
-            add_template(fp, (fp.first[s], fp.first[s + 1]), stamps[t], part[i], Canvas(y, at))
-            if t > 0:
-                d, (ratio, k) = shift[s, t - 1], shift_prior(shift[s], scatter)
-                moved = (SHARE * diagonal[i] + 2.0 * part[i] * d) / (1.0 + ratio)
-                slope += (k * (d * d + moved) - 1.0) / scatter
-    return z, mixed, h, y, slope
 
 
 @inner()
@@ -373,20 +191,23 @@ def gradient(problem, w, rendered, parameters, basis, out):
 
     `out` are two arrays: for the source parameters and the background coefficients. Returns the
     derivatives with respect to position_scatter and model_error, NaN where the likelihood is zero,
-    and z.
+    and what helps to search nearby.
     """
     o, frame, background = problem.optics, problem.frame, parameters.background
     level, noise = background[0], given(frame.noise, parameters)
     value = log_likelihood(frame, w, parameters)
     if not rendered.extra + value > -math.inf:
-        return (math.nan, math.nan), np.empty((0, 0))
+        nothing = np.empty((0, 0))
+        return (math.nan, math.nan), Nearby(nothing, np.empty(0), nothing)
     fp, pitch = rendered.footprints, w.image.size // o.ny
     layout = layout_of(o, rendered.geometry, fp, parameters.nuisances.psf_sigma)
     wanted = _wanted(rendered.profiled, w)
     weigh_rows(frame, noise, w, (background, (0, o.ny)), wanted[0], wanted[1])
     scatter, profiled = parameters.nuisances.position_scatter, rendered.profiled
     response = _responses(noise, frame, w, background)
-    z, mixed, h, y, slope = _laplace_adjoint(w, layout, rendered, profiled, scatter, response)
+    z, mixed, h, y, slope, nearby = laplace_adjoint(
+        w, layout, rendered, profiled, scatter, response
+    )
     image, below, by_error = _images(noise, frame, w, background, h, y)
     add_background_sums(frame, w, below, out[1])
     out[1][0] += unreached(noise, unreached_pixels(frame, w), level)[1]
@@ -397,4 +218,4 @@ def gradient(problem, w, rendered, parameters, basis, out):
     sums, weights = new_sums(o, basis, pitch), np.empty(most)
     amplitudes = _Amplitudes(rendered.fluxes, z, mixed, image, row_starts(fp, pitch))
     _add_sources(layout, basis, w, amplitudes, (sums, weights), out[0])
-    return (slope, by_error), z
+    return (slope, by_error), nearby
