@@ -2,7 +2,8 @@
 
 The most likely ones are a smooth function of the other parameters. Within a posterior's width it is
 nearly linear: what its secants leave is little enough for one Newton step of fluxes, see
-`kernels/extrapolate.py`, and for two or three of fluxes and shifts, see `kernels/fluxes.py`.
+`kernels/extrapolate.py`, and for two or three of fluxes and shifts, see
+`kernels/shift_newton.py`.
 """
 
 import math

@@ -219,7 +219,7 @@ class Posterior(FrameDensity):
         Scattered positions: it extrapolates fluxes and shifts. It looks for their maximum from
         there, until the rest of the way is known well enough: values differ by some 1e-6 for every
         source, up to 3e-5 for faint ones. Beyond 5 + sqrt(d) standard deviations it looks for them
-        as usual. Where a shift has several modes of nearly one height, either may have been found.
+        as usual.
 
         Otherwise, also with fixed fluxes and a model error, it is the posterior itself.
 
