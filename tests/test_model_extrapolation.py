@@ -194,9 +194,11 @@ def test_wrong_beliefs_about_shifts_cost_time_alone_unless_they_are_about_the_re
         {"found": beliefs.found * [1.02, 0.5, 0.5]},
         {"slope": 0.0 * beliefs.slope},
         {"nearby": known._replace(bends=0.0 * known.bends)},
-        {"nearby": known._replace(bends=-1e9 + 0.0 * known.bends)},  # the search fails
+        {"nearby": known._replace(bends=-1e9 + 0.0 * known.bends)},  # no step can be taken by them
     ):
         assert errors(**parts).max() < SCATTERED_AGREE
+    # fluxes grow twofold in a step: the search does not end, and is made again from nothing
+    assert errors(found=beliefs.found * [1e-6, 1.0, 1.0]).max() == 0.0
     # negative control: without the change of the determinant it is not
     unbent = known._replace(e=0.0 * known.e, spread=0.0 * known.spread)
     assert errors(nearby=unbent).max() > 10.0 * errors().max()

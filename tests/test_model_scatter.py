@@ -106,6 +106,29 @@ def test_gradient_is_that_of_log_prob(case: str) -> None:
     )
 
 
+@pytest.mark.parametrize("offset", [(0.3, 0.3), (0.4, 0.1)])
+def test_derivatives_are_found_far_from_the_frame_in_a_crowded_field(
+    offset: tuple[float, float],
+) -> None:
+    """Sources 0.4 px off their images, all of them touching: residuals are most of the Hessian.
+
+    What log_prob has found, to the last digits, is where the search for the derivatives begins.
+    """
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-50.0, 50.0, (2, 400))
+    sources = SourceCatalog(x, y, 2e3 * rng.lognormal(0.0, 1.0, 400))
+    lens = PolynomialDistortion.polynomial(2)
+    model = ForwardModel(Detector((120, 120)), sources, GaussianPSF(1.2), lens)
+    frame = rng.poisson(model.expected_counts(np.zeros(lens.n_terms), 3.0)).astype(float)
+    posterior = Posterior(model, frame, nuisances=SCATTER)
+    params = posterior.start()
+    names = "offset_x", "offset_y", "background", "position_scatter"
+    for name, value in zip(names, (*offset, 12.0, 0.12), strict=True):
+        params[posterior.parameter_names.index(name)] = value
+    assert math.isfinite(posterior.log_prob(params))
+    assert np.isfinite(posterior.gradient(params)).all()
+
+
 class Mode(NamedTuple):
     """A mode of the fluxes and shifts of a frame, from dense images."""
 
