@@ -72,7 +72,7 @@ class Workspace(NamedTuple):
     ratio: Floats
     # what profiling fills again on every call, kept because new memory costs more than its use
     heap: Floats
-    scratch: Floats  # (5, STRETCH)
+    scratch: Floats  # (4, STRETCH)
     # images of the gradient, of which the marked segments are made zero before they are used
     images: tuple[Floats, Floats, Floats, Floats]
 

@@ -51,7 +51,7 @@ def new_workspace(o: Optics, nuisances: SourceNuisances, free: Literal[True] | N
     flags = np.zeros(size // SEGMENT, np.uint8)
     image, score, heap = map(_aligned, (size, size, more))
     weight, ratio = (score, _aligned(0)) if free is None else map(_aligned, (size, size))
-    scratch = _aligned(5 * STRETCH).reshape(5, STRETCH)
+    scratch = _aligned(4 * STRETCH).reshape(4, STRETCH)
     one, two, three, four = map(_aligned, (size,) * 4)
     return Workspace(
         image, flags, span, score, weight, ratio, heap, scratch, (one, two, three, four)

@@ -22,11 +22,13 @@ from bayesfred.model.kernels.cumulants import CumulantTable
 from bayesfred.model.kernels.mean_series import MeanSeries, no_mean_series
 from bayesfred.model.kernels.noise_dispatch import derivatives, information, log_density
 from bayesfred.model.kernels.poisson_gaussian import (
+    SINGLE,
     WIDE,
     at,
     density_of,
     derivatives_of,
     kind_of,
+    nearest,
     steps,
 )
 from bayesfred.model.kernels.read_noise_sums import GROUP, Alike, sum_up
@@ -59,8 +61,7 @@ class ReadNoiseTerms(NamedTuple):
 
     kind: tuple[int, ...]  # see `kind_of`
     variance: float | Floats  # of the read noise, counts^2: one number, or for padded rows
-    steps: tuple[Floats, Floats] | None  # see `steps`, of a frame whose pixels need the sum
-    alike: tuple[Alike, Alike] | None  # of a frame some of whose pixels need the sum
+    alike: tuple[Alike, Alike] | None  # of a frame whose pixels differ in their read noise
     row: float | Floats  # in the table of information
     first: Floats  # these three are `InformationRows`
     step: Floats
@@ -259,31 +260,30 @@ def most_likely(noise, n, out):
 
 
 @entry(fastmath=FAST)
-def _find_steps(n, variance, up, down):
+def _find_steps(n, variance, photons, up, down):
     for i in range(n.size):
+        photons[i] = nearest(n[i])
         up[i], down[i] = steps(n[i], 1.0 / variance[i])
-
-
-def frame_steps(values: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """The steps of the sum for the pixels of padded rows."""
-    up, down = np.empty(values.size), np.empty(values.size)
-    _find_steps(values.ravel(), variance, up, down)
-    return up, down
 
 
 def alike_pixels(values: Floats, variance: Floats) -> tuple[Alike, Alike]:
     """The pixels of padded rows that need the sum, and those that need the expansion."""
-    few, many = (
-        _alike(values.ravel(), variance, values.ravel() > LIMIT, wide) for wide in (False, True)
+    counts, wide = values.ravel(), variance >= WIDE
+    few, many = (_alike(counts, variance, (counts > LIMIT) & own) for own in (~wide, wide))
+    photons, up, down = (np.empty(few.counts.size) for _ in range(3))
+    _find_steps(few.counts, *few.constants, photons, up, down)
+    inverse = 1.0 / many.constants[0]
+    single = (many.counts * inverse).astype(SINGLE), inverse.astype(SINGLE)
+    return (
+        few._replace(counts=photons, constants=(up, down)),
+        many._replace(constants=(*many.constants, *single)),
     )
-    return few._replace(constants=frame_steps(few.counts, *few.constants)), many
 
 
-def _alike(values: Floats, variance: Floats, used: Flags, wide: bool) -> Alike:
-    chosen = used & ((variance >= WIDE) == wide)
+def _alike(counts: Floats, variance: Floats, chosen: Flags) -> Alike:
     first = np.append(0, np.cumsum(np.count_nonzero(chosen.reshape(-1, SEGMENT), axis=1)))
-    counts, own = (np.append(each[chosen], np.ones(GROUP)) for each in (values, variance))
-    return Alike(first, np.flatnonzero(chosen).astype(np.int32), counts, (own,))
+    n, r2 = (np.append(each[chosen], np.ones(GROUP)) for each in (counts, variance))
+    return Alike(first, np.flatnonzero(chosen).astype(np.uint32), n, (r2,))
 
 
 def _typical_level(counts: Floats, variance: float) -> float:
@@ -323,5 +323,5 @@ def new_terms(
 ) -> ReadNoiseTerms:
     """The compiled half for pixels in the order in which they are given, without a frame."""
     return ReadNoiseTerms(
-        kind_of(variance), variance, None, None, row, *rows, no_series(), None, no_mean_series()
+        kind_of(variance), variance, None, row, *rows, no_series(), None, no_mean_series()
     )

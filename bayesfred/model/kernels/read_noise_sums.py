@@ -5,9 +5,8 @@ waits for the one before, and a processor works on a pixel's and its neighbours'
 only if these are short. So a stretch is summed in several passes, whose results stay in the fastest
 cache in between. What needs few digits is float32, of which a register holds twice as many. A table
 is read one number at a time, because instructions that gather several are slower. The logarithm of
-four pixels' factors is that of their product. Where some pixels need one formula and some the
-other, what a frame knows of them is sorted by formula beforehand, and a sum gathers their means
-alone.
+four pixels' factors is that of their product. Where pixels differ in their read noise, what a frame
+knows of them is sorted by formula beforehand, and a sum gathers their means alone.
 """
 
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from numba import types
 from numba.extending import overload
 
 from bayesfred._typing import Floats, Ints
-from bayesfred.imaging.kernels.compilation import inner, leaf
+from bayesfred.imaging.kernels.compilation import leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, as_bits, as_float, log
 from bayesfred.model.kernels.contexts import LIMIT, MASKED, STRETCH
@@ -31,7 +30,6 @@ from bayesfred.model.kernels.poisson_gaussian import (
     correction,
     density_of,
     improved,
-    nearest,
     photon_sum,
     rough_log,
     rough_omega,
@@ -39,19 +37,21 @@ from bayesfred.model.kernels.poisson_gaussian import (
     tilted_mean,
 )
 
-GROUP = 16  # gathered pixels come in whole groups: loops are slow where they end within a vector
+INFINITE = 1e30  # variance of counts at which log phi has no correction
+GROUP = 8  # gathered pixels come in whole groups: loops are slow where they end within a vector
 
 
 class Alike(NamedTuple):
     """The pixels in a frame's likelihood that need the same formula, in the frame's order.
 
-    So those of some successive segments lie one after another here, too.
+    So those of some successive segments lie one after another here, too. The sum's `constants` are
+    its steps. Those of the expansion are r^2, and n / r^2 and 1 / r^2 as float32.
     """
 
     first: Ints  # (segments + 1,) number of the first one in a segment or later
-    place: npt.NDArray[np.int32]  # (n,) in the padded frame
-    counts: Floats  # (n + GROUP,)
-    constants: tuple[Floats, ...]  # likewise; the sum's steps, or the variance of the read noise
+    place: npt.NDArray[np.uint32]  # (n,) in the padded frame
+    counts: Floats  # (n + GROUP,); for the sum the nearest numbers of photons
+    constants: tuple[Any, ...]  # likewise
 
 
 @leaf(fastmath=REDUCE)
@@ -140,29 +140,17 @@ def _sum_segments(table, noise, values, mean, place):
 
 
 @leaf(fastmath=FAST)
-def _in_singles(values, mean, mu, n, m):
-    """The mean, MASKED where a pixel does not count, and float32 counts and mean."""
-    image, level, response = mean
-    for i in range(image.size):
-        counted, expected = values[i] > LIMIT, scaled(image[i] + level, response, i)
-        mu[i] = expected if counted else MASKED
-        n[i] = values[i] if counted else 0.0
-        m[i] = max(expected, LEAST)
+def _in_singles(x, single):
+    for i in range(x.size):
+        single[i] = SINGLE(x[i])
 
 
 @leaf(fastmath=FAST)
-def _invert(variance, inverse):
-    for i in range(variance.size):
-        inverse[i] = SINGLE(1.0) / SINGLE(variance[i])
-
-
-@leaf(fastmath=FAST)
-def _find_x(slope, level, inverse):
-    """n / r^2, log(mu / r^2) and x, in place of n, mu and 1 / r^2."""
-    for i in range(inverse.size):
-        slope[i] *= inverse[i]
-        level[i] = rough_log(max(level[i] * inverse[i], LEAST_SINGLE))
-        inverse[i] = slope[i] + level[i]
+def _find_x(mu, slope, inverse, level, x):
+    """log(mu / r^2) and x."""
+    for i in range(x.size):
+        level[i] = rough_log(max(mu[i] * inverse[i], LEAST_SINGLE))
+        x[i] = slope[i] + level[i]
 
 
 @leaf(fastmath=FAST)
@@ -182,9 +170,9 @@ def _compare_omega(level, x, w):
 
 @leaf(fastmath=FAST)
 def _find_tilts(slope, level, x, w):
-    """The tilts, in place of the slopes."""
+    """The tilts, in place of the levels."""
     for i in range(x.size):
-        slope[i] = rough_tilt(slope[i], level[i], x[i], w[i])
+        level[i] = rough_tilt(slope[i], level[i], x[i], w[i])
 
 
 @leaf(fastmath=FAST)
@@ -194,24 +182,21 @@ def _find_means(mu, s, y):
 
 
 @leaf(fastmath=REDUCE)
-def _sum_tilted(variance, values, mu, tilts, v):
+def _sum_tilted(variance, counts, mu, tilts, v):
     """The sum of log p without log phi, and v = y + r^2."""
     (s, y), total = tilts, 0.0
     for i in range(mu.size):
-        term, _, _, spread = improved(values[i], mu[i], variance[i], float(s[i]), y[i])
-        counted = mu[i] > LIMIT
-        v[i] = spread if counted else 1.0
-        term = term if mu[i] >= 0.0 else MASKED
-        total += term if counted else 0.0
+        term, _, _, spread = improved(counts[i], mu[i], variance[i], float(s[i]), y[i])
+        v[i] = spread
+        total += term if mu[i] > LIMIT else 0.0
     return total
 
 
 @leaf(fastmath=REDUCE)
-def _sum_corrections(variance, mu, v):
+def _sum_corrections(variance, v):
     total = 0.0
     for i in range(v.size):
-        term = correction(v[i], variance[i])
-        total += term if mu[i] > LIMIT else 0.0
+        total += correction(v[i], variance[i])
     return total
 
 
@@ -225,94 +210,83 @@ def _sum_logs(q):
 
 
 @leaf()
-def _sum_expansion(variance, values, mean, scratch):
-    """The sum of the saddlepoint expansion over pixels that differ in their read noise."""
-    one, two, total = scratch[0].view(SINGLE), scratch[1].view(SINGLE), 0.0
-    for a in range(0, values.size, STRETCH):
-        n, r = values[a : a + STRETCH], variance[a : a + STRETCH]
-        slope, level = one[: n.size], one[STRETCH : STRETCH + n.size]
-        x, w = two[: n.size], two[STRETCH : STRETCH + n.size]
-        # v has the room of x and w
-        y, v, mu = scratch[2, : n.size], scratch[1, : n.size], scratch[3, : n.size]
-        _in_singles(n, part_of(mean, a, n.size), mu, slope, level)
-        _invert(r, x)
-        _find_x(slope, level, x)
-        _guess_omega(x, w)
-        _compare_omega(level, x, w)
-        _find_tilts(slope, level, x, w)
-        _find_means(mu, slope, y)
-        total += _sum_tilted(r, n, mu, (slope, y), v)
-        total += _sum_corrections(r, mu, v) - 0.5 * _sum_logs(v)
-    return total
+def _sum_expansion(counts, constants, mu, size, scratch):
+    """The sum of the saddlepoint expansion over the first pixels of whole groups."""
+    (variance, slope, inverse), y = constants, scratch[2, : mu.size]
+    one, two = scratch[0].view(SINGLE), scratch[1].view(SINGLE)
+    level, m = one[: mu.size], one[STRETCH : STRETCH + mu.size]
+    x, w = two[: mu.size], two[STRETCH : STRETCH + mu.size]
+    _in_singles(mu, m)
+    _find_x(m, slope, inverse, level, x)
+    _guess_omega(x, w)
+    _compare_omega(level, x, w)
+    _find_tilts(slope, level, x, w)
+    _find_means(mu, level, y)
+    v = scratch[1, : mu.size]  # in place of x and w
+    total = _sum_tilted(variance, counts, mu, (level, y), v)
+    v[size:] = INFINITE
+    total += _sum_corrections(variance, v)
+    v[size:] = 1.0
+    return total - 0.5 * _sum_logs(v)
 
 
 @leaf(fastmath=FAST)
-def _find_sums(steps, values, mean, sums, mu):
-    """The photon sums, and the mean, which is MASKED where a pixel does not count."""
-    (up, down), (image, level, response) = steps, mean
-    for i in range(image.size):
-        mu[i] = scaled(image[i] + level, response, i) if values[i] > LIMIT else MASKED
-        sums[i] = photon_sum(nearest(values[i]), max(mu[i], LEAST), up[i], down[i])
+def _find_sums(photons, steps, mu, sums):
+    up, down = steps
+    for i in range(mu.size):
+        sums[i] = photon_sum(photons[i], max(mu[i], LEAST), up[i], down[i])
 
 
 @leaf(fastmath=REDUCE)
-def _sum_powers(values, mu, sums):
-    """The sum of k log(mu) - mu, and photon sums of 1 where a pixel does not count."""
+def _sum_powers(photons, mu):
+    """The sum of k log(mu) - mu."""
     total = 0.0
     for i in range(mu.size):
-        term = nearest(values[i]) * log(max(mu[i], LEAST)) - mu[i]
-        counted = mu[i] > LIMIT
-        sums[i] = sums[i] if counted else 1.0
-        term = term if mu[i] >= 0.0 else MASKED
-        total += term if counted else 0.0
+        total += photons[i] * log(max(mu[i], LEAST)) - mu[i]
     return total
 
 
 @leaf()
-def _sum_photons(steps, values, mean, scratch):
-    """The sum of log p over pixels that differ in their read noise, from the steps of each."""
-    (up, down), total = steps, 0.0
-    for a in range(0, values.size, STRETCH):
-        n, here = values[a : a + STRETCH], (up[a : a + STRETCH], down[a : a + STRETCH])
-        sums, mu = scratch[0, : n.size], scratch[3, : n.size]
-        _find_sums(here, n, part_of(mean, a, n.size), sums, mu)
-        total += _sum_powers(n, mu, sums) + _sum_logs(sums)
-    return total
+def _sum_photons(photons, steps, mu, size, scratch):
+    """The sum of log p over the first pixels of whole groups; the others' mean becomes 1."""
+    sums = scratch[0, : mu.size]
+    _find_sums(photons, steps, mu, sums)
+    sums[size:], mu[size:] = 1.0, 1.0
+    return _sum_powers(photons, mu) + (mu.size - size) + _sum_logs(sums)
 
 
-@leaf(fastmath=FAST)
+@leaf(fastmath=REDUCE)
 def _gather(place, start, mean, mu):
-    """The means of pixels in these places, and MASKED up to a whole group; how many that makes."""
-    image, level, response = mean
+    """The means of pixels in these places, and MASKED up to a whole group; the least of them."""
+    (image, level, response), begin, least = mean, np.uint64(start), 0.0
     for i in range(place.size):
-        j = np.uint64(place[i] - start)
+        j = np.uint64(place[i]) - begin
         mu[i] = scaled(image[j] + level, response, j)
-    filled = (place.size + GROUP - 1) // GROUP * GROUP
-    for i in range(place.size, filled):
-        mu[i] = MASKED
-    return filled
+        least = min(least, mu[i])
+    mu[place.size :] = MASKED
+    return least
 
 
 @leaf()
-def _sum_mixed(few, many, mean, place):
-    """The sum over pixels some of which need one formula, some the other."""
-    (start, scratch), total = place, 0.0
-    begin, end, mu = start // SEGMENT, (start + mean[0].size) // SEGMENT, scratch[4]
-    (up, down), variance, last = few.constants, many.constants[0], few.first[end]
+def _sum_map(few, many, mean, place):
+    """The sum over pixels that differ in their read noise, from the formula that each needs."""
+    (start, scratch), total, least = place, 0.0, 0.0
+    begin, end = start // SEGMENT, (start + mean[0].size) // SEGMENT
+    (up, down), last = few.constants, few.first[end]
     for a in range(few.first[begin], last, STRETCH):
-        b = a + _gather(few.place[a : min(a + STRETCH, last)], start, mean, mu)
-        own = (mu[: b - a], 0.0, None)
-        total += _sum_photons((up[a:b], down[a:b]), few.counts[a:b], own, scratch)
-    last = many.first[end]
+        places = few.place[a : min(a + STRETCH, last)]
+        b = a + (places.size + GROUP - 1) // GROUP * GROUP
+        mu = scratch[3, : b - a]
+        least = min(least, _gather(places, start, mean, mu))
+        total += _sum_photons(few.counts[a:b], (up[a:b], down[a:b]), mu, places.size, scratch)
+    (variance, slope, inverse), last = many.constants, many.first[end]
     for a in range(many.first[begin], last, STRETCH):
-        b = a + _gather(many.place[a : min(a + STRETCH, last)], start, mean, mu)
-        total += _sum_expansion(variance[a:b], many.counts[a:b], (mu[: b - a], 0.0, None), scratch)
-    return total
-
-
-@inner(inline="always")
-def _steps_of(noise, first, size):
-    return noise.steps[0][first : first + size], noise.steps[1][first : first + size]
+        places = many.place[a : min(a + STRETCH, last)]
+        b = a + (places.size + GROUP - 1) // GROUP * GROUP
+        mu, own = scratch[3, : b - a], (variance[a:b], slope[a:b], inverse[a:b])
+        least = min(least, _gather(places, start, mean, mu))
+        total += _sum_expansion(many.counts[a:b], own, mu, places.size, scratch)
+    return total if least >= 0.0 else MASKED
 
 
 def sum_up(noise: Any, values: Any, mean: Any, place: Any) -> Any:
@@ -328,14 +302,4 @@ def _choose_sum(noise: Any, values: Any, mean: Any, place: Any) -> Any:
         return lambda noise, values, mean, place: _sum_segments(
             noise.cumulants, (noise.kind, noise.variance), values, mean, place
         )
-    if len(kinds["kind"]) == 0:
-        return lambda noise, values, mean, place: _sum_photons(
-            _steps_of(noise, place[0], values.size), values, mean, place[1]
-        )
-    if len(kinds["kind"]) == 1:
-        return lambda noise, values, mean, place: _sum_expansion(
-            noise.variance[place[0] : place[0] + values.size], values, mean, place[1]
-        )
-    return lambda noise, values, mean, place: _sum_mixed(
-        noise.alike[0], noise.alike[1], mean, place
-    )
+    return lambda noise, values, mean, place: _sum_map(noise.alike[0], noise.alike[1], mean, place)

@@ -28,7 +28,6 @@ from bayesfred.model.kernels.read_noise import (
     InformationRows,
     ReadNoiseTerms,
     alike_pixels,
-    frame_steps,
     informations,
     log_densities,
     most_likely,
@@ -174,11 +173,7 @@ def frame_terms(read_noise: float | Floats, values: Floats) -> ReadNoiseTerms:
     terms = _terms(read_noise)
     if isinstance(read_noise, float):
         return terms._replace(cumulants=cumulant_table(read_noise**2, values, SEGMENT))
-    if len(terms.kind) == 2:
-        return terms._replace(alike=alike_pixels(values, read_noise**2))
-    if len(terms.kind) == 0:
-        return terms._replace(steps=frame_steps(values, read_noise**2))
-    return terms
+    return terms._replace(alike=alike_pixels(values, read_noise**2))
 
 
 def _terms(read_noise: float | Floats) -> ReadNoiseTerms:
