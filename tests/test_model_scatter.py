@@ -129,6 +129,37 @@ def test_derivatives_are_found_far_from_the_frame_in_a_crowded_field(
     assert np.isfinite(posterior.gradient(params)).all()
 
 
+def test_blended_stars_that_scatter_widely_are_found_from_afar() -> None:
+    """Steps of blended bright stars go too far, again and again, where nothing holds them back.
+
+    Without a line search there was no start from which the maximum is searched for.
+    """
+    side, n, rng = 80, 200, np.random.default_rng(5)
+    x, y = rng.uniform(-32.0, 32.0, (2, n))
+    flux, lens = 2e4 * rng.lognormal(0.0, 1.0, n), PolynomialDistortion.polynomial(2)
+
+    def model(x: Floats, y: Floats) -> ForwardModel:
+        sources = SourceCatalog(x, y, flux)
+        return ForwardModel(Detector((side, side)), sources, GaussianPSF(1.0), lens)
+
+    dx, dy = 0.1 * rng.standard_t(DOF, (n, 2)).T
+    image = model(x + dx, y + dy).expected_counts(np.zeros(lens.n_terms), 3.0)
+    frame = rng.poisson(image).astype(np.float64)
+    nuisances = Nuisances("free", offset=True, psf_sigma=True, position_scatter=True)
+    posterior = Posterior(model(x, y), frame, nuisances=nuisances)
+    found = find_map(posterior)
+    assert found.at_maximum and found.fits_data
+    named = dict(zip(posterior.parameter_names, found.params, strict=True))
+    scale = dict(zip(posterior.parameter_names, np.sqrt(np.diag(found.covariance)), strict=True))
+    truth = {"psf_sigma": 1.0, "background": 3.0, "position_scatter": 0.1}
+    assert all(abs(named[k] - own) < 4.0 * scale[k] for k, own in truth.items())
+    far = found.params + 30.0 * rng.standard_normal((10, found.params.size)) * [*scale.values()]
+    for name, own in truth.items():
+        k = posterior.parameter_names.index(name)
+        far[:, k] = np.clip(far[:, k], 0.5 * own, 2.0 * own)
+    assert np.isfinite(posterior.log_prob(far)).all()
+
+
 class Mode(NamedTuple):
     """A mode of the fluxes and shifts of a frame, from dense images."""
 

@@ -21,7 +21,7 @@ from bayesfred.optimize.fit_statistics import consistent, fit_statistics, misfit
 from bayesfred.optimize.joint_map import maximize_frames
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.modes import ModeSearch, find_modes
-from bayesfred.optimize.newton import NEAR, NewtonResult, maximize
+from bayesfred.optimize.newton import NEAR, NO_DENSITY, NewtonResult, maximize
 from bayesfred.optimize.outliers import BREAKDOWN, COARSE, Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
 
@@ -34,11 +34,6 @@ Frames = TypeVar("Frames", Posterior, JointPosterior)
 MOST_NAMED = 3  # frames
 MATCHED = 0.5  # of the sources; of fewer the search rather than the terms is to blame
 STEPS = 8  # of Newton's method where the maximum itself is not wanted
-
-NO_DENSITY = (
-    "start: the posterior has no density there, expected parameters within the prior whose map "
-    "does not fold"
-)
 
 # What the message of a search suggests that has not rejected them.
 OUTLIERS = ", unmatched sources or spurious detections (reject_outliers leaves them out)"

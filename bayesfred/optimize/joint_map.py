@@ -26,7 +26,7 @@ from bayesfred.model.psf_errors import PsfErrors, covariance_of, refuse_nodes
 from bayesfred.optimize.determined import require_light, undetermined
 from bayesfred.optimize.estimate import inverse
 from bayesfred.optimize.modes import find_modes
-from bayesfred.optimize.newton import NewtonResult, maximize
+from bayesfred.optimize.newton import NO_DENSITY, NewtonResult, maximize
 from bayesfred.optimize.outliers import Kept
 from bayesfred.optimize.starts import find_start
 
@@ -96,10 +96,7 @@ def maximize_frames(
         joint = with_frames(joint, {name: each.posterior for name, each in kept.items()})
     params = _combined(joint, origins) if begin is None else begin
     if not np.isfinite(joint.log_prob(params)):
-        raise InputError(
-            "start: the posterior has no density there, expected parameters within the prior whose "
-            "map does not fold"
-        )
+        raise InputError(NO_DENSITY)
     _require_determined(joint, params)
     top = maximize(joint, params)
     evaluations = spent + top.evaluations + 1

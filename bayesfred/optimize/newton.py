@@ -41,6 +41,11 @@ KEPT = 3.0
 # A Newton step is followed by another if it gains this part of what it predicts.
 AS_PREDICTED = 0.1
 
+NO_DENSITY = (
+    "start: the posterior has no density there, expected parameters within the prior whose map "
+    "does not fold, and about where the images are if fluxes or positions are free"
+)
+
 
 class NewtonResult(NamedTuple):
     """Where a search ended.

@@ -39,12 +39,10 @@ from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import move
 from bayesfred.model.kernels.clusters import (
-    DOF,
     Prior,
     add_template,
     copy,
     one_cluster,
-    shift_prior,
 )
 from bayesfred.model.kernels.expansion import Pixels, expand
 from bayesfred.model.kernels.flux_newton import (
@@ -52,11 +50,10 @@ from bayesfred.model.kernels.flux_newton import (
     make_templates,
     start,
 )
-from bayesfred.model.kernels.likelihood import slope_run, stretch
-from bayesfred.model.kernels.noise_dispatch import given, sum_pixels
+from bayesfred.model.kernels.noise_dispatch import given
 from bayesfred.model.kernels.patches import add_patch, fill_excess, new_patch, weigh_patch
 from bayesfred.model.kernels.shift_modes import other_mode
-from bayesfred.model.kernels.shift_newton import change_source, maximize
+from bayesfred.model.kernels.shift_newton import change_source, log_density, log_prior, maximize
 
 TRIES = 4  # other modes that are looked at in a cluster
 TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
@@ -80,34 +77,20 @@ def _known(cluster, s):
 
 
 @inner()
-def _log_density(frame, parameters, cluster, h):
-    """What the log-density of a cluster's mode and its width say, up to constants."""
-    patch, noise, value = cluster.patch, given(frame.noise, parameters), 0.0
-    for j in range(patch.first.size):
-        a, b, first = patch.start[j], patch.start[j + 1], patch.first[j]
-        image = patch.image[a:b]
-        part = stretch(frame, parameters.background, patch.top + j, first, image)
-        slope_run(part, patch.score[a:b])
-        mean = (patch.score[a:b], part.c0, None)
-        value += sum_pixels(noise, part.values, image, mean, first)
-    return value + _log_prior(cluster, h)
+def _half_log_determinant(cluster, h):
+    """Of H in the logarithms of the fluxes, from Cholesky's factor of H."""
+    start, value = cluster.group.start, 0.0
+    for i in range(start.size):
+        value += math.log(h[start[i] + i])
+    for s in cluster.group.members:
+        value += math.log(cluster.fluxes[s])
+    return value
 
 
 @inner()
-def _log_prior(cluster, h):
-    """Of a cluster's fluxes and shifts, less half the logarithm of H's determinant."""
-    prior, start, value = cluster.prior, cluster.group.start, 0.0
-    constant = 0.5 * math.log(2.0 * math.pi) - math.lgamma(prior.shape)
-    for i in range(start.size):
-        value -= math.log(h[start[i] + i])
-    for s in cluster.group.members:
-        scale, flux = cluster.scale[s], cluster.fluxes[s]
-        value += (prior.shape - 1.0) * math.log(flux / scale) - flux / scale
-        value += constant - math.log(scale)
-        if prior.scatter > 0.0:
-            ratio, _ = shift_prior(cluster.shifts[s], prior.scatter)
-            value -= (0.5 * DOF + 1.0) * math.log1p(ratio) + 2.0 * math.log(prior.scatter)
-    return value
+def _log_evidence(frame, parameters, cluster, h):
+    """What the log-density of a cluster's mode and its width say, up to constants."""
+    return log_density(frame, parameters, cluster) - _half_log_determinant(cluster, h)
 
 
 @inner()
@@ -127,14 +110,14 @@ def _climb(frame, parameters, cluster, known, h):
         if gains[i] < TIE:
             break
         if factor.size == 0:
-            value, factor = gain + _log_density(frame, parameters, cluster, h), np.empty(h.size)
+            value, factor = gain + _log_evidence(frame, parameters, cluster, h), np.empty(h.size)
         gains[i] = -math.inf
         old_fluxes, old_shifts = fluxes[members], shifts[members]
         dx, dy = (ratios[i] - 1.0) * old_shifts[i]
         change_source(cluster, members[i], 0.0, dx, dy, 0.0)
         more = maximize(frame, parameters, cluster, known, factor)
         if not math.isnan(more):
-            there = more + _log_density(frame, parameters, cluster, factor)
+            there = more + _log_evidence(frame, parameters, cluster, factor)
             if there > value:
                 value, gain = there, more
                 copy(factor, h)
@@ -197,6 +180,6 @@ def profile(problem, layout, w, parameters, known, profiled):
             weigh_patch(problem.frame, noise, parameters.background, patch, rows, patch.ratio)
             pixels = Pixels(patch.weight, patch.ratio, at)
             value += expand(touching, group, fluxes, shape, pixels)[0]
-        value += gain + _log_prior(cluster, h)
+        value += gain + log_prior(cluster) - _half_log_determinant(cluster, h)
         add_patch(patch, w.image)
     return value

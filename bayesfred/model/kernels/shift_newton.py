@@ -2,6 +2,10 @@
 
 Newton's iteration, with H less the second derivatives where that is positive definite.
 
+Far from the maximum the steps of blended sources go too far, again and again. So after some visits
+a step is halved until log L + log p(log F) is not lower than before: it is a direction uphill, as
+its matrix is positive definite.
+
 Nearby. Where e and G - H of `gradient.py` are known from other parameters nearby the search ends
 early. Let g be the gradient and d the step that is left. Then at the maximum log L + log p is
 higher by 1/2 g d, and -1/2 log det H by e d. Of d a step leaves the share sqrt(rate), by which
@@ -30,7 +34,8 @@ from bayesfred.model.kernels.clusters import (
     solve,
 )
 from bayesfred.model.kernels.flux_newton import make_templates, maximize_fluxes
-from bayesfred.model.kernels.noise_dispatch import exact_weight, given
+from bayesfred.model.kernels.likelihood import slope_run, stretch
+from bayesfred.model.kernels.noise_dispatch import exact_weight, given, sum_pixels
 from bayesfred.model.kernels.patches import weigh_patch
 
 # Shifts, in widths of the PSF, that change templates to first order: log det H changes by as much,
@@ -40,7 +45,10 @@ STILL_EARLY = 3e-6  # where the search ends early
 LONGEST = 8.0  # Newton steps in one
 CLOSE = 1e-16  # square of the distance from the maximum, in standard deviations
 VAGUE = 0.2  # of a change of log det H, since e depends on the parameters
-VISITS = 8  # of all pixels, after which a search does not end early
+PATIENT, HALVES = 10, 8  # visits before steps are only taken uphill; how often one is halved
+CERTAIN = 0.01  # square of the distance from which on they are anyway
+MOST_VISITS = 200  # of all pixels in a search
+VISITS = 8  # after which one does not end early
 ENOUGH = 3e-6  # error of the log-likelihood for every source, with which a search ends early
 
 
@@ -196,6 +204,53 @@ def _secant(gradient, step, distances, shares, most):
 
 
 @inner()
+def log_prior(cluster):
+    """The log-density of the logarithms of a cluster's fluxes, and of its shifts."""
+    prior, value = cluster.prior, 0.0
+    constant = 0.5 * math.log(2.0 * math.pi) - math.lgamma(prior.shape)
+    for s in cluster.group.members:
+        ratio = cluster.fluxes[s] / cluster.scale[s]
+        value += constant + prior.shape * math.log(ratio) - ratio
+        if prior.scatter > 0.0:
+            far, _ = shift_prior(cluster.shifts[s], prior.scatter)
+            value -= (0.5 * DOF + 1.0) * math.log1p(far) + 2.0 * math.log(prior.scatter)
+    return value
+
+
+@inner()
+def log_density(frame, parameters, cluster):
+    """Log L + log p of a cluster's fluxes and shifts, up to constants."""
+    patch, noise, value = cluster.patch, given(frame.noise, parameters), 0.0
+    for j in range(patch.first.size):
+        a, b, first = patch.start[j], patch.start[j + 1], patch.first[j]
+        image = patch.image[a:b]
+        part = stretch(frame, parameters.background, patch.top + j, first, image)
+        slope_run(part, patch.score[a:b])
+        mean = (patch.score[a:b], part.c0, None)
+        value += sum_pixels(noise, part.values, image, mean, first)
+    return value + log_prior(cluster)
+
+
+@inner()
+def _turn_back(frame, parameters, cluster, way, value):
+    """Go back by half a step, and half of that, until the log-density is not lower than `value`.
+
+    Blended sources far from their maximum may go too far again and again. `way` is the step and
+    what share of it was taken. Returns the log-density.
+    """
+    step, shares = way
+    for _ in range(HALVES):
+        here = log_density(frame, parameters, cluster)
+        if here >= value:
+            break
+        shares *= 0.5
+        for i in range(shares.size):
+            own = -shares[i] * step[3 * i : 3 * i + 3]
+            change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+    return here
+
+
+@inner()
 def _change_of_width(cluster, nearby, shares, step):
     """By how much -1/2 log det H changes on the rest of the way, see `gradient.py`."""
     total, scatter = 0.0, cluster.prior.scatter
@@ -225,7 +280,8 @@ def maximize(frame, parameters, cluster, known, h):
     distance, rate, converged = 0.0, 1.0, False
     shares, distances = np.ones(group.members.size), np.zeros(group.members.size)
     gradient = np.empty(step.size)
-    for _ in range(VISITS if early else 100):
+    value = -math.inf
+    for visit in range(VISITS if early else MOST_VISITS):
         weigh_patch(frame, noise, parameters.background, patch, (0, patch.first.size), None)
         fresh = converged or rate > 0.01  # otherwise the last matrix serves
         if fresh:
@@ -260,6 +316,9 @@ def maximize(frame, parameters, cluster, known, h):
         # templates follow by second derivatives that are right only about: steps must get shorter
         still = 0.0 if rate > 0.1 else (STILL_EARLY if early else STILL)
         largest = _take_step(cluster, step, shares, exact, still)
+        if visit >= PATIENT and size > 1 and distance > CERTAIN:
+            way = step, shares
+            value = _turn_back(frame, parameters, cluster, way, value)
         if fresh and size == 1 and exact:
             rate = largest * largest
         left = distance * min(rate, 1.0)
