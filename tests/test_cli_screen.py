@@ -190,6 +190,13 @@ def test_columns_without_numbers_are_left_out() -> None:
     assert heads == ["parameter", *expected]
 
 
+def test_an_error_that_is_not_known_is_blank() -> None:
+    summary = parameters(robust_sd=np.array([1.3e-7, np.nan]), truth=np.array([np.nan, 5.0]))
+    lines = rendered(parameter_table(summary, 200), 200)
+    assert any("0.13 e-06" in line for line in lines)
+    assert not any("nan" in line for line in lines)
+
+
 def test_a_ranking_of_long_paths_fits() -> None:
     score = SimpleNamespace(
         name="chains/" + "x" * 90 + ".h5", n_parameters=12, elpd=-123456.7, elpd_se=123.4,

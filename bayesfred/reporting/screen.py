@@ -64,7 +64,10 @@ def parameter_table(summary: Any, width: int) -> Table:
         if key not in summary.colnames:
             return []
         shown = zip(scales, summary[key], powers, strict=True)
-        return [scale.number(value) + power for scale, value, power in shown]
+        return [
+            scale.number(value) + power if np.isfinite(value) else ""
+            for scale, value, power in shown
+        ]
 
     def numbers(key: str, form: str) -> list[str]:
         if key not in summary.colnames:
