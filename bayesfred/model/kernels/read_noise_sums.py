@@ -140,9 +140,9 @@ def _sum_segments(table, noise, values, mean, place):
 
 
 @leaf(fastmath=FAST)
-def _in_singles(x, single):
-    for i in range(x.size):
-        single[i] = SINGLE(x[i])
+def _in_singles(mu, single):
+    for i in range(mu.size):
+        single[i] = SINGLE(max(mu[i], LEAST))  # MASKED has no finite float32
 
 
 @leaf(fastmath=FAST)

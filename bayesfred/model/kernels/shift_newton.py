@@ -268,7 +268,7 @@ def _change_of_width(cluster, nearby, shares, step):
 def maximize(frame, parameters, cluster, known, h):
     """Newton's iteration for a cluster; leaves Cholesky's factor of H in h.
 
-    Returns what the rest of the way to the maximum gains, which is nothing unless z is known; NaN
+    Returns what the rest of the way to the maximum gains, which is nothing unless e is known; NaN
     if it fails.
     """
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
