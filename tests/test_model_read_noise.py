@@ -221,7 +221,7 @@ def test_wide_frames_and_extreme_pixels_are_summed_pixel_by_pixel(case: str) -> 
     distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])
     model = ForwardModel(Detector(WIDE), sources, GaussianPSF(9.0), distortion)
     noise, rng = PoissonNoise(EXTREMES[case]), np.random.default_rng(711)
-    for background in (0.05, 5.0):
+    for background in (0.05, 5.0, 200.0):
         image = model.expected_counts([0.0, 0.0], background)
         counts = noise.draw(image, 0.0, rng)
         counts[3, 500:520], counts[4, 511:514] = -40.0, 2e4
