@@ -720,7 +720,7 @@ flux = 1000
 [study]
 """
 
-STUDY = [sys.executable, "-c", "from bayesfred.cli import app; app()", "study", "run.toml"]
+STUDY = [sys.executable, "-m", "bayesfred", "study", "run.toml"]
 
 
 @pytest.fixture

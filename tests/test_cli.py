@@ -93,10 +93,10 @@ def invoke(folder: Path, *args: str | Path, data: Path | None = None) -> Output:
 
 
 def command(*args: str) -> list[str]:
-    """The command line as a process of its own, which a Ctrl-C reaches in any case."""
+    """The installed command as a process of its own, which a Ctrl-C reaches in any case."""
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from "
-        "bayesfred.cli import app; app()"
+        "bayesfred.__main__ import main; main()"
     )
     return [sys.executable, "-c", code, *args]
 
@@ -1267,6 +1267,8 @@ def stop_a_run(folder: Path, number: signal.Signals) -> tuple[int, list[str]]:
         wait_for(lambda: re.search(rb"\b[1-9]\d* steps", log.read_bytes()), process, 180)
         process.send_signal(number)
         code = process.wait(60)
+    except subprocess.TimeoutExpired:
+        pytest.fail(f"the run did not end: {log.read_text(encoding='utf-8')[-2000:]!r}")
     finally:
         process.kill()
         process.wait()

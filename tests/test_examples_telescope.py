@@ -18,7 +18,7 @@ import pytest
 import bayesfred as bf
 
 ROOT = Path(__file__).parents[1]
-RUN = (sys.executable, "-c", "from bayesfred.cli import app; app()")
+RUN = (sys.executable, "-m", "bayesfred")
 
 
 def call(folder: Path, *command: str) -> tuple[int, str]:
