@@ -379,7 +379,8 @@ class FrameLikelihood:
     @cached_property
     def _problem(self) -> Problem:
         flux, shape = self.model.sources.flux, self.nuisances.flux_shape
-        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free)
+        scatters: Literal[True] | None = True if self.nuisances.position_scatter else None
+        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free, scatters)
 
     @cached_property
     def near_problem(self) -> Problem:

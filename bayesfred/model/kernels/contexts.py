@@ -44,6 +44,7 @@ class Problem(NamedTuple):
     faint: Flags  # (s,) sources for which the term of `expansion.py` counts
     # None where fluxes are fixed: a type of its own, for which what profiles them is not compiled
     free: Literal[True] | None
+    scatters: Literal[True] | None  # whether positions are free, too; None where not, likewise
 
 
 class Nearby(NamedTuple):
@@ -124,6 +125,7 @@ class Touching(NamedTuple):
     clusters: Clusters
     stamps: Floats  # (templates, samples)
     faint: Flags  # (s,) that of `Problem`
+    scatters: Literal[True] | None  # that, too
 
 
 class Profiled(NamedTuple):

@@ -33,7 +33,7 @@ def _fill_image(problem, layout, w, parameters, known, free):
     boxes = bounding_boxes(fp)
     clusters = find_clusters(boxes, o.ny, templates)
     stamps = room(w, w.image.size, templates * fp.start[fp.row.size]).reshape(templates, -1)
-    touching = Touching(fp, boxes, clusters, stamps, problem.faint)
+    touching = Touching(fp, boxes, clusters, stamps, problem.faint, problem.scatters)
     factors, shifts = np.empty(clusters.begin[-1]), np.zeros((fluxes.size, 2))
     profiled = Profiled(touching, factors, fluxes, shifts, problem.shape)
     return profile(problem, layout, w, parameters, known, profiled), fluxes, profiled
@@ -60,9 +60,10 @@ def render(problem, w, parameters, known):
 @inner()
 def _keep(fluxes, profiled, out):
     """Keep fluxes and shifts."""
-    out[:, 0] = fluxes
-    if profiled is not None:
-        out[:, 1:] = profiled.shifts
+    for s in range(fluxes.size):  # to assign arrays would compile messages about their shapes
+        out[s, 0] = fluxes[s]
+        if profiled is not None:
+            out[s, 1], out[s, 2] = profiled.shifts[s]
 
 
 @entry()

@@ -71,10 +71,16 @@ def make_templates(cluster, s, flux):
     first, last = fp.first[s], fp.first[s + 1]
     stamps[:, fp.start[first] : fp.start[last]] = 0.0
     if stamps.shape[0] > 1:
-        add_templates(cluster.layout, s, flux, stamps, None)
+        _add_three(cluster.layout, s, flux, stamps, cluster.touching.scatters)
     else:
         canvas = Canvas(stamps[0], fp.start)
         add_source(cluster.layout, s, (first, last), 1.0, canvas, None)
+
+
+@leaf()
+def _add_three(layout, s, flux, stamps, scatters):
+    if scatters is not None:
+        add_templates(layout, s, flux, stamps, None)
 
 
 @leaf(fastmath=REDUCE)

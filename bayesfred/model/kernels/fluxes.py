@@ -48,9 +48,10 @@ from bayesfred.model.kernels.expansion import Pixels, expand
 from bayesfred.model.kernels.flux_newton import (
     Cluster,
     make_templates,
+    maximize_fluxes,
     start,
 )
-from bayesfred.model.kernels.noise_dispatch import given
+from bayesfred.model.kernels.noise_dispatch import by_exactness, given
 from bayesfred.model.kernels.patches import add_patch, fill_excess, new_patch, weigh_patch
 from bayesfred.model.kernels.shift_modes import other_mode
 from bayesfred.model.kernels.shift_newton import change_source, log_density, log_prior, maximize
@@ -129,6 +130,27 @@ def _climb(frame, parameters, cluster, known, h):
     return gain
 
 
+def _flux_maximum(noise, frame, parameters, cluster, known, h):
+    return 0.0 if maximize_fluxes(frame, parameters, cluster, h) else math.nan
+
+
+def _newton_maximum(noise, frame, parameters, cluster, known, h):
+    return maximize(frame, parameters, cluster, known, h)
+
+
+# What `maximize` does where positions do not scatter.
+_maximum_of_fluxes = by_exactness(_flux_maximum, _newton_maximum)
+
+
+@inner()
+def _highest(problem, parameters, cluster, known, h, scatters):
+    """Leave a cluster at its highest maximum, as `maximize` does at one."""
+    frame = problem.frame
+    if scatters is None:
+        return _maximum_of_fluxes(frame.noise, frame, parameters, cluster, known, h)
+    return _climb(frame, parameters, cluster, known, h)
+
+
 @inner()
 def _resume(cluster, start):
     """Templates and image of fluxes and shifts that are known already."""
@@ -171,7 +193,7 @@ def profile(problem, layout, w, parameters, known, profiled):
         else:
             fill_excess(problem.frame, parameters.background, patch)
             start(cluster, max(parameters.background[0], 1.0))
-        gain = _climb(problem.frame, parameters, cluster, known, h)
+        gain = _highest(problem, parameters, cluster, known, h, touching.scatters)
         if math.isnan(gain):
             return math.nan if known.nearby.e.size > 0 else -math.inf
         if np.any(touching.faint[group.members]):

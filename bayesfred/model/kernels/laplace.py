@@ -153,15 +153,24 @@ def _fill_part(adjoint, group, shape, ratio, h, part):
 
 
 @inner()
+def _bend(adjoint, group, scattered, part, g, scatters):
+    """Add all second derivatives of a cluster, those of the shifts' prior included."""
+    if scatters is not None:
+        prior, shifts = scattered
+        for i in range(group.members.size):
+            _second_derivatives(adjoint, group, i, part[3 * i : 3 * i + 3], g)
+            xx, xy, yy = bend_prior(shifts[group.members[i]], prior.scatter)
+            add_block(i, group.start, g, (0.0, 0.0, 0.0, xx, xy, yy))
+
+
+@inner()
 def _hessian(adjoint, group, prior, shifts, part, lower):
     """Cholesky's factor of G; it is positive definite at a maximum, elsewhere H has to do."""
-    size, g = adjoint.mixed.shape[0], np.empty(lower.size)
+    g = np.empty(lower.size)
     gram(adjoint.touching, group, adjoint.response, adjoint.at, g)
     add_prior(g, group, prior, adjoint.fluxes, shifts, SHARE)
-    for i in range(group.members.size if size > 1 else 0):
-        _second_derivatives(adjoint, group, i, part[i * size : (i + 1) * size], g)
-        xx, xy, yy = bend_prior(shifts[group.members[i]], prior.scatter)
-        add_block(i, group.start, g, (0.0, 0.0, 0.0, xx, xy, yy))
+    if adjoint.mixed.shape[0] > 1:
+        _bend(adjoint, group, (prior, shifts), part, g, adjoint.touching.scatters)
     return g if cholesky(g, group) else lower
 
 
