@@ -245,8 +245,7 @@ class FrameLikelihood:
 
     def draw_fluxes(self, rng: np.random.Generator) -> Floats:
         """Free fluxes of all sources from their prior, shape (s,), counts."""
-        shape = self.nuisances.flux_shape
-        flux = self.model.sources.flux
+        flux, shape = self.model.sources.flux, self.nuisances.flux_shape
         return flux * rng.gamma(shape, 1.0 / shape, flux.size)
 
     def simulate(
@@ -378,9 +377,9 @@ class FrameLikelihood:
 
     @cached_property
     def _problem(self) -> Problem:
-        flux, shape = self.model.sources.flux, self.nuisances.flux_shape
-        scatters: Literal[True] | None = True if self.nuisances.position_scatter else None
-        return Problem(self._optics, self._frame, flux, shape, self._faint, self._free, scatters)
+        flux, n = self.model.sources.flux, self.nuisances
+        kinds = self._free, n.position_scatter or None
+        return Problem(self._optics, self._frame, flux, n.flux_shape, self._faint, *kinds)
 
     @cached_property
     def near_problem(self) -> Problem:
