@@ -232,3 +232,49 @@ def test_errors_of_functions_that_are_linked_in_keep_their_values(tmp_path):
         command = [sys.executable, str(program)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         assert done.stdout == "('negative', -3.0)\n"
+
+
+COMPILED = """
+import sys
+from numba.core import event
+import bayesfred as bf
+
+class Names(event.Listener):
+    def on_start(self, event):
+        print(event.data["dispatcher"].py_func.__qualname__)
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Names())
+flux, *scatters = sys.argv[1:]
+stars = bf.SourceCatalog.grid(2, 12.0, 1e4)
+terms = bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)])
+model = bf.ForwardModel(bf.Detector((32, 32)), stars, bf.GaussianPSF(1.5), terms)
+nuisances = bf.Nuisances(flux=flux, position_scatter=bool(scatters))
+posterior = bf.Posterior(model, bf.simulate(model, [0.0, 0.0], 5.0, seed=1), nuisances=nuisances)
+posterior.log_prob(posterior.start())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("nuisances", "some", "none"),
+    [
+        (("fixed",), "log_likelihoods", {"profile"}),
+        (("free",), "maximize_fluxes", {"maximize", "change_source"}),
+        # negative control
+        pytest.param(("free", "scatters"), "maximize", set(), marks=pytest.mark.long),
+    ],
+)
+def test_a_likelihood_compiles_what_it_needs(
+    nuisances: tuple[str, ...], some: str, none: set[str], tmp_path: Path
+) -> None:
+    """And no messages of numba about arrays whose shapes do not match."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", COMPILED, *nuisances]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    compiled = set(done.stdout.split())
+    assert some in compiled
+    assert not compiled & none
+    assert not [name for name in compiled if "shape" in name]
