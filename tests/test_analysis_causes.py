@@ -253,7 +253,13 @@ def odd_frames() -> dict[str, Posterior]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", list(odd_frames()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "scatter" else ())  # to compile
+        for name in odd_frames()
+    ],
+)
 def test_causes_of_odd_frames_are_sentences(name: str) -> None:
     posterior = odd_frames()[name]
     params = np.append(np.zeros(4), posterior.start()[4:])

@@ -66,7 +66,13 @@ def test_counts_are_those_of_the_dense_image(detector: bf.Detector) -> None:
     assert model.expected_counts(theta) == pytest.approx(expected, abs=1e-7 * expected.max())
 
 
-@pytest.mark.parametrize("nuisances", NUISANCES.values(), ids=NUISANCES)
+@pytest.mark.parametrize(
+    "nuisances",
+    [
+        pytest.param(each, marks=pytest.mark.slow if name == "error" else (), id=name)  # to compile
+        for name, each in NUISANCES.items()
+    ],
+)
 @pytest.mark.parametrize("detector", DETECTORS.values(), ids=DETECTORS)
 def test_derivatives_are_those_of_the_general_loops(
     detector: bf.Detector, nuisances: bf.Nuisances

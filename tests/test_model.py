@@ -532,8 +532,16 @@ def test_nuisances_are_checked(choice: dict[str, Any]) -> None:
         Nuisances(**choice)
 
 
-@pytest.mark.parametrize("scatter", [False, True])
-@pytest.mark.parametrize("model_error", [False, True])
+@pytest.mark.parametrize(
+    ("scatter", "model_error"),
+    [
+        (False, False),
+        # what costs most to compile is among the slow ones
+        pytest.param(False, True, marks=pytest.mark.slow),
+        pytest.param(True, False, marks=pytest.mark.slow),
+        pytest.param(True, True, marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_begin_with_what_log_prob_found(scatter: bool, model_error: bool) -> None:
     """They are those of a search of their own, and what they begin with is used."""
     model = make_model()

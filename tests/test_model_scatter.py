@@ -84,10 +84,9 @@ def at_random(posterior: Posterior, named: dict[str, float], rng: np.random.Gene
     return np.asarray(truth + 0.5 * errors(posterior, truth) * rng.uniform(-1, 1, truth.size))
 
 
-# what costs most to compile is among the long runs
-NAMES = [
-    pytest.param(name, marks=pytest.mark.long if name == "printed kernel" else ()) for name in CASES
-]
+# what costs most to compile is among the slow and the long runs
+COSTLY = {"read noise": pytest.mark.slow, "printed kernel": pytest.mark.long}
+NAMES = [pytest.param(name, marks=COSTLY.get(name, ())) for name in CASES]
 
 
 @pytest.mark.parametrize("case", NAMES)

@@ -133,6 +133,7 @@ def undersampled(seed: int, hot: int) -> tuple[bf.Posterior, Floats, Floats]:
     return posterior, places[:, :6], np.stack([u, v])
 
 
+@pytest.mark.slow  # to compile
 def test_hot_pixels_are_no_sources_though_stars_are_undersampled() -> None:
     posterior, stars, hot = undersampled(1, HOT)
     found = looked(posterior)

@@ -326,6 +326,7 @@ def test_undetermined_parameters_are_named() -> None:
     assert find_map(Posterior(model, posterior.counts)).fits_data
 
 
+@pytest.mark.slow  # to compile
 @pytest.mark.parametrize(
     ("make", "sources", "degree"),
     [
