@@ -98,7 +98,7 @@ def _log_evidence(frame, parameters, cluster, h):
 def _climb(frame, parameters, cluster, known, h):
     """The same for the highest mode: a shift may have two, see `shift_modes.py`."""
     gain = maximize(frame, parameters, cluster, known, h)
-    if math.isnan(gain) or cluster.touching.stamps.shape[0] == 1:
+    if math.isnan(gain):
         return gain
     members, fluxes, shifts = cluster.group.members, cluster.fluxes, cluster.shifts
     gains, ratios = np.empty(members.size), np.empty(members.size)
@@ -138,7 +138,7 @@ def _newton_maximum(noise, frame, parameters, cluster, known, h):
     return maximize(frame, parameters, cluster, known, h)
 
 
-# What `maximize` does where positions do not scatter.
+# The maximum of fluxes alone.
 _maximum_of_fluxes = by_exactness(_flux_maximum, _newton_maximum)
 
 
@@ -146,7 +146,7 @@ _maximum_of_fluxes = by_exactness(_flux_maximum, _newton_maximum)
 def _highest(problem, parameters, cluster, known, h, scatters):
     """Leave a cluster at its highest maximum, as `maximize` does at one."""
     frame = problem.frame
-    if scatters is None:
+    if scatters is None or cluster.touching.stamps.shape[0] == 1:  # or by a scatter of 0
         return _maximum_of_fluxes(frame.noise, frame, parameters, cluster, known, h)
     return _climb(frame, parameters, cluster, known, h)
 

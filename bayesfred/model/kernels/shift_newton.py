@@ -33,7 +33,7 @@ from bayesfred.model.kernels.clusters import (
     shift_prior,
     solve,
 )
-from bayesfred.model.kernels.flux_newton import make_templates, maximize_fluxes
+from bayesfred.model.kernels.flux_newton import make_templates
 from bayesfred.model.kernels.likelihood import slope_run, stretch
 from bayesfred.model.kernels.noise_dispatch import exact_weight, given, sum_pixels
 from bayesfred.model.kernels.patches import weigh_patch
@@ -122,15 +122,11 @@ def change_source(cluster, s, flux, dx, dy, still):
 
 @inner()
 def _take_step(cluster, step, shares, together, still):
-    """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`.
-
-    Returns the largest relative change of the whole step.
-    """
+    """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`."""
     fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
-    fluxes, size, most, least = cluster.fluxes, cluster.touching.stamps.shape[0], 0.0, math.inf
+    fluxes, size, least = cluster.fluxes, cluster.touching.stamps.shape[0], math.inf
     for i in range(members.size):
         largest = _relative(cluster, step, i)
-        most = max(most, largest)
         if shares[i] * largest >= 0.5:
             shares[i] = min(shares[i], 1.0 / (1.0 + largest))
         least = min(least, shares[i])
@@ -143,7 +139,6 @@ def _take_step(cluster, step, shares, together, still):
         else:
             fluxes[s] += own[0]
             add_template(fp, (fp.first[s], fp.first[s + 1]), stamps[0], own[0], cluster.canvas)
-    return most
 
 
 @inner(fastmath=REDUCE)
@@ -272,8 +267,6 @@ def maximize(frame, parameters, cluster, known, h):
     if it fails.
     """
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
-    if touching.stamps.shape[0] == 1 and exact_weight(given(frame.noise, parameters)):
-        return 0.0 if maximize_fluxes(frame, parameters, cluster, h) else math.nan
     size, noise = touching.stamps.shape[0], given(frame.noise, parameters)
     exact, early, enough = exact_weight(noise), known.nearby.e.size > 0, ENOUGH * group.members.size
     step, lower = np.zeros(group.lead.size), h.copy() if size > 1 else h
@@ -296,8 +289,7 @@ def maximize(frame, parameters, cluster, known, h):
             _secant(gradient, step, distances, shares, LONGEST if size == 1 else 1.0)
         copy(gradient, step)
         solve(lower, group, step)
-        # The square of the distance in standard deviations, and what a step leaves of it: in a
-        # Newton step of fluxes alone the square of the largest relative change.
+        # the square of the distance in standard deviations, and what a step leaves of it
         before, distance = distance, np.dot(gradient, step)
         rate = distance / before if before > 0.0 else 1.0
         if fresh and distance <= CLOSE:
@@ -315,12 +307,10 @@ def maximize(frame, parameters, cluster, known, h):
                 return gain if cholesky(h, group) else math.nan
         # templates follow by second derivatives that are right only about: steps must get shorter
         still = 0.0 if rate > 0.1 else (STILL_EARLY if early else STILL)
-        largest = _take_step(cluster, step, shares, exact, still)
+        _take_step(cluster, step, shares, exact, still)
         if visit >= PATIENT and size > 1 and distance > CERTAIN:
             way = step, shares
             value = _turn_back(frame, parameters, cluster, way, value)
-        if fresh and size == 1 and exact:
-            rate = largest * largest
         left = distance * min(rate, 1.0)
         converged = left <= CLOSE or (early and 0.5 * left * math.sqrt(rate) <= enough)
     return math.nan
