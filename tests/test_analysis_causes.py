@@ -1,5 +1,6 @@
 """Causes of a misfit: planted faults are named first, a true model has none, the sums are right."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -177,6 +178,16 @@ def test_numbers_in_the_sentences_are_those_planted() -> None:
     assert number("origin", "shifted by ") == pytest.approx(-planted.HALF, abs=5.0)
     assert number("a factor of all fluxes", "sources have ") == pytest.approx(1.6, rel=0.05)
     assert "nuisances.offset = true" in causes["shift"].remedy
+
+
+def test_the_read_noise_to_set_is_all_of_it() -> None:
+    """Also where some is known already; its Monte Carlo error is 1 %."""
+    posterior = replace(planted.read_noise(7), noise=PoissonNoise(read_noise=6.0))
+    (cause,) = judged(posterior).causes
+    assert cause.name == "read noise"
+    number = float(cause.remedy.split("about ")[1])
+    assert number == pytest.approx(8.0, rel=0.05)
+    assert number != pytest.approx(math.sqrt(8.0**2 - 6.0**2), rel=0.1)
 
 
 def test_excess_of_a_displaced_source_is_what_the_derivation_says() -> None:

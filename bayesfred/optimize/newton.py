@@ -6,9 +6,10 @@ they overshoot or crawl, so that the differences of gradients over the last few 
 BFGS updates, damped as Powell does to keep it positive definite. Where that does not help, scipy's
 BFGS takes over, in coordinates in which the information is the identity. Where the map folds there
 is no density; the search meets the paraboloid that its start predicts instead. Where a prior ends,
-a Newton step goes to the highest point, within the prior's support, of the paraboloid at hand.
-Where that step vanishes is the maximum, inside the support or at its edge, where the gradient
-points out of it.
+a Newton step goes to the highest point, within the prior's support, of the paraboloid at hand, but
+not all the way to an edge that is far: a scatter of zero would be hard to leave again. Where that
+step vanishes is the maximum, inside the support or at its edge, where the gradient points out of
+it.
 """
 
 import itertools
@@ -37,6 +38,9 @@ LEAST_CURVATURE = 0.1  # of what is known already: less is damped
 # Standard deviations from the maximum within which the information changes less than it differs
 # from the curvature anyway: it is computed again where it is reported, or where it does not serve.
 KEPT = 3.0
+
+# Of the way to an edge of the prior's support that lies farther than a standard deviation.
+TOWARDS_EDGE = 0.9
 
 # A Newton step is followed by another if it gains this part of what it predicts.
 AS_PREDICTED = 0.1
@@ -117,11 +121,13 @@ def maximize(
             information, is_own = posterior.information(params), True
         gradient = posterior.gradient(params)
         try:
-            newton = _newton_step(posterior.support, params, gradient, information)
+            reach = _reach(posterior.support, params, information)
+            newton = _newton_step(reach, params, gradient, information)
             serves = close_enough < newton.distance < CLOSER * nearest
             if not is_own and not (serves and evaluations < MOST_EVALUATIONS):
                 information, is_own = posterior.information(params), True
-                newton = _newton_step(posterior.support, params, gradient, information)
+                reach = _reach(posterior.support, params, information)
+                newton = _newton_step(reach, params, gradient, information)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
             unknown = np.full_like(information, np.nan)
             return NewtonResult(params, value, unknown, np.inf, evaluations)
@@ -130,7 +136,7 @@ def maximize(
         if len(points) > 1:
             with suppress(linalg.LinAlgError):
                 curvature = _corrected(information, points)
-                way = _newton_step(posterior.support, params, gradient, curvature)
+                way = _newton_step(reach, params, gradient, curvature)
         closer = newton.distance < CLOSER * nearest
         nearest, stalled = (newton.distance, 0) if closer else (nearest, stalled + 1)
         if (
@@ -184,6 +190,25 @@ def _advance(
         if 0.0 < gain < np.inf:
             return there, value + gain, gain, fraction, evaluations
     return params, value, gain, fraction, evaluations
+
+
+def _reach(
+    support: tuple[Floats, Floats], params: Floats, information: Floats
+) -> tuple[Floats, Floats]:
+    """How far a step may go: to the support's edges, or most of the way to those that are far.
+
+    Where some source lies off its place, the density of the scatter of positions rises from zero as
+    a power: Newton's steps from there would only double it.
+    """
+    low, high = (
+        np.where(
+            np.abs(edge - params) * np.sqrt(np.diag(information)) > 1.0,
+            params + TOWARDS_EDGE * (edge - params),
+            edge,
+        )
+        for edge in support
+    )
+    return low, high
 
 
 def _newton_step(

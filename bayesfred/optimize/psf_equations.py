@@ -45,6 +45,7 @@ SECANTS = 6  # turns that accelerate the next
 RATES = (0.5, 5.0)  # times the evidence's own change that a strength goes
 LEAST_DETERMINED = 1e-2  # coefficients of a block
 LARGEST_ERROR = 0.1  # that weights know of: with more, what surrounds a source tells its flux
+LEAST_SCATTER = 1e-6  # pixel: less is not seen, and lost in the rounding of the equations
 SCATTER, WIDTH = "position_scatter", "psf_sigma"
 HELD = (SCATTER, WIDTH, "model_error")  # parameters that are not solved for here
 
@@ -393,5 +394,6 @@ def shift_precision(posterior: Posterior, state: PsfState) -> Floats:
     """The prior's, of every source's flux and shifts, shape (3 s,): 0 of fluxes."""
     out = np.zeros((len(state.fluxes), 3))
     if posterior.nuisances.position_scatter:
-        out[:, 1:] = state.params[posterior.parameter_names.index(SCATTER)] ** -2.0
+        scatter = state.params[posterior.parameter_names.index(SCATTER)]
+        out[:, 1:] = max(scatter, LEAST_SCATTER) ** -2.0
     return out.ravel()

@@ -1,5 +1,6 @@
 """Hypotheses about pixels: saturation, the noise's variance, the background."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -200,8 +201,8 @@ def _finding_of_noise(context: Context, name: str, ratio: float, growth: Floats)
         remedy = f"check frame.gain: {1.0 / ratio:.3g} times the present one would cure it"
     elif name == "read noise":
         sentence = f"{found}, and at bright sources with less: some variance is constant"
-        known = getattr(context.posterior.noise, "shift", 0.0)
-        remedy = f"set noise.read_noise to about {(variance + known) ** 0.5:.3g}"
+        known = float(np.median(getattr(context.posterior.noise, "read_noise", 0.0)))
+        remedy = f"set noise.read_noise to about {math.hypot(variance**0.5, known):.3g}"
     elif name == "pedestal":
         sentence = f"{found}, and at bright sources with more: {variance:.3g} counts are no photons"
         remedy = f"check frame.pedestal, {variance:.3g} counts more, or a smaller read_noise"
