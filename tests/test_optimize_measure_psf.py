@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import bayesfred as bf
+from bayesfred.errors import InputError
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.optimize import measure_psf as measuring
+from bayesfred.optimize import psf_equations
 from bayesfred.optimize.measure_psf import psf_message
 from bayesfred.optimize.psf_samples import likely_error
 
@@ -136,6 +138,30 @@ def test_a_poor_first_psf_does_not_pass_for_scattered_positions(monkeypatch) -> 
         off.append((estimate.params[k] - SCATTER) / np.sqrt(estimate.covariance[k, k]))
     assert abs(off[0]) < 3.0
     assert off[1] > 5.0
+
+
+@pytest.mark.slow
+def test_a_psf_is_measured_where_positions_do_not_scatter_at_all(monkeypatch) -> None:
+    """A scatter of 1e-11 pixels, that of a search which ended there, is the same as one of 1e-6.
+
+    Without a least one, the control, rounding makes the equations singular.
+    """
+    posterior, _ = undersampled(0)
+    gaussian, k = bf.find_map(posterior), posterior.parameter_names.index("position_scatter")
+
+    def measured(scatter: float) -> np.ndarray:
+        params = gaussian.params.copy()
+        params[k] = scatter
+        return bf.fit_psf(posterior, replace(gaussian, params=params)).coefficients
+
+    known = measured(1e-6)
+    np.testing.assert_allclose(measured(1e-11), known, atol=1e-6 * known.max())
+    monkeypatch.setattr(psf_equations, "LEAST_SCATTER", 0.0)
+    try:
+        singular = measured(1e-11)
+    except InputError:
+        return
+    assert np.abs(singular - known).max() > 1e-3 * known.max()
 
 
 @pytest.mark.statistics

@@ -11,6 +11,7 @@ from test_model import LIMIT
 import bayesfred as bf
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.optimize import newton
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.newton import maximize
 from bayesfred.sampling.chain import Chain
@@ -135,3 +136,32 @@ def test_a_gradient_that_is_nearly_right() -> None:
     result = maximize(Tilted(), near)
     assert result.distance < 1e-3
     assert np.abs((result.params[:2] - MEAN) / SD).max() < 1e-3
+
+
+class Rising(CutGaussian):
+    """A scale whose density rises from zero as a power, as where some source lies off its place."""
+
+    parameter_names = ("scale",)
+    support = np.zeros(1), np.full(1, np.inf)
+
+    def log_prob(self, params: ArrayLike) -> Floats:
+        x = np.asarray(params)[..., 0]
+        with np.errstate(invalid="ignore"):
+            inside = 5.0 * np.log(x + 1e-18) - (x / 0.012) ** 4
+        return np.asarray(np.where(x >= 0.0, inside, -np.inf))
+
+    def gradient(self, params: ArrayLike) -> Floats:
+        x = np.asarray(params)
+        return np.asarray(5.0 / (x + 1e-18) - 4.0 * x**3 / 0.012**4)
+
+    def information(self, params: ArrayLike) -> Floats:
+        x = np.asarray(params)  # less than the curvature far out: the first step is too long
+        return np.asarray([5.0 / (x + 1e-18) ** 2 + 2.0 * x**2 / 0.012**4])
+
+
+def test_a_scale_does_not_fall_to_zero_in_one_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, most_likely = np.array([0.06]), 0.012 * 1.25**0.25
+    assert Rising().log_prob([0.0]) > Rising().log_prob(start)
+    assert maximize(Rising(), start, steps=8).params == pytest.approx(most_likely, rel=1e-2)
+    monkeypatch.setattr(newton, "TOWARDS_EDGE", 1.0)  # negative control
+    assert maximize(Rising(), start, steps=8).params < 1e-12

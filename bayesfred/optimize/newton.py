@@ -121,13 +121,11 @@ def maximize(
             information, is_own = posterior.information(params), True
         gradient = posterior.gradient(params)
         try:
-            reach = _reach(posterior.support, params, information)
-            newton = _newton_step(reach, params, gradient, information)
+            newton = _newton_step(posterior.support, params, gradient, information)
             serves = close_enough < newton.distance < CLOSER * nearest
             if not is_own and not (serves and evaluations < MOST_EVALUATIONS):
                 information, is_own = posterior.information(params), True
-                reach = _reach(posterior.support, params, information)
-                newton = _newton_step(reach, params, gradient, information)
+                newton = _newton_step(posterior.support, params, gradient, information)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
             unknown = np.full_like(information, np.nan)
             return NewtonResult(params, value, unknown, np.inf, evaluations)
@@ -136,7 +134,7 @@ def maximize(
         if len(points) > 1:
             with suppress(linalg.LinAlgError):
                 curvature = _corrected(information, points)
-                way = _newton_step(reach, params, gradient, curvature)
+                way = _newton_step(posterior.support, params, gradient, information, curvature)
         closer = newton.distance < CLOSER * nearest
         nearest, stalled = (newton.distance, 0) if closer else (nearest, stalled + 1)
         if (
@@ -212,11 +210,20 @@ def _reach(
 
 
 def _newton_step(
-    support: tuple[Floats, Floats], params: Floats, gradient: Floats, information: Floats
+    support: tuple[Floats, Floats],
+    params: Floats,
+    gradient: Floats,
+    information: Floats,
+    curvature: Floats | None = None,
 ) -> _Step:
-    """The step to the top of the paraboloid within the support; LinAlgError if it has none."""
-    low, high = support
-    information = _at_edges(information, params, gradient, (low, high))
+    """The step to the top of the paraboloid within reach; LinAlgError if it has none.
+
+    Its curvature is the information, or another one that is better known.
+    """
+    low, high = _reach(support, params, information)
+    information = _at_edges(
+        information if curvature is None else curvature, params, gradient, (low, high)
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = 1.0 / np.sqrt(np.diag(information))  # rows differ by many orders of magnitude
     scaled = information * np.outer(scale, scale)
