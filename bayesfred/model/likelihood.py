@@ -174,17 +174,17 @@ class FrameLikelihood:
             known = fisher(self._problem, w, rendered, parameters, self._basis, others)
         if np.isnan(known[0]):
             return np.full((len(self.parameters),) * 2, np.nan)
-        # the size of shifts and residuals tells of scatter and model error, whatever the others
+        # of scatter and model error the size of shifts and residuals tells, whatever the others
         apart, size = len(SCALES), sources + len(SCALES) + len(BACKGROUND_TERMS)
         out = np.zeros((size, size))
         index = [*range(sources), *range(sources + apart, sources + apart + terms)]
         out[np.ix_(index, index)] = others
         own = slice(sources, sources + apart)
         out[own, own] = np.diag(known)
-        change = self._chain_rule(params)
-        found = change.T @ out @ change
+        found = (change := self._chain_rule(params)).T @ out @ change
         if self.occam:
-            found[self._error, self._error] += self.occam.information(params[self._error])
+            k = self._error
+            found[k, k] -= self.occam.lost(params[k], found[k, k])
         return np.asarray(found)
 
     def expected_counts(self, params: Floats) -> Floats:

@@ -35,6 +35,7 @@ from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure
 from bayesfred.io.serialize import serializable
 from bayesfred.model.parameters import SCALES
 
+MOST_LOST = 0.9  # of the information about the model error
 STREAM = 0x507F  # of random numbers, beside those of a run's steps
 
 
@@ -115,11 +116,15 @@ class OccamFactor:
         """The derivative of the logarithm."""
         return float(error / (self.scales**2 + error**2) @ self.numbers)
 
-    def information(self, error: float) -> float:
-        """Minus the second derivative where it is positive."""
-        square = self.scales**2
-        curvature = (error**2 - square) / (square + error**2) ** 2 @ self.numbers
-        return max(float(curvature), 0.0)
+    def lost(self, error: float, known: float) -> float:
+        """What is lost of the information that is known about the model error, to these numbers.
+
+        A pixel's residual, of variance proportional to s^2 + eps^2, tells (d ln variance / d eps)^2
+        / 2. The residuals of as many pixels as there are numbers tell nothing. Where these are
+        about all, what is left is rounding.
+        """
+        lost = 2.0 * (error / (self.scales**2 + error**2)) ** 2 @ self.numbers
+        return min(float(lost), MOST_LOST * known)
 
 
 @serializable("psf_errors")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.imaging.kernels.compilation import entry, inner, leaf
+from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import SEGMENT
 from bayesfred.imaging.kernels.geometry import layout_of, row_starts
 from bayesfred.imaging.kernels.jacobian import add_jacobian_rows
@@ -31,6 +31,7 @@ from bayesfred.model.kernels.likelihood import (
     unreached_pixels,
 )
 from bayesfred.model.kernels.noise_dispatch import (
+    by_exactness,
     error_information,
     given,
     information,
@@ -39,6 +40,7 @@ from bayesfred.model.kernels.noise_dispatch import (
 )
 
 BAND = 16  # rows of the Jacobian held at a time
+MOST_LOST = 0.9  # of the information about the model error; more is rounding
 EXPECTED = (DOF + 2.0) / (DOF + 4.0)
 
 
@@ -169,6 +171,95 @@ def _subtract_profiled(w, rendered, profiled, scatter, cross, out):
     return known
 
 
+@leaf()
+def _weigh_by_error(frame, noise, w, background):
+    """W c into w.score and W c^2 into w.ratio, where c = d ln variance / d eps."""
+    pitch = frame.values.size // frame.ny
+    for j in range(frame.ny):
+        c0, c1, c2 = background_row(background, j, frame.ny)
+        start, stop = next_run(w, j, w.span[j, 0])
+        while start >= 0:
+            for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
+                u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
+                mu = w.image[p] + c0 + u * (c1 + u * c2)
+                c = math.sqrt(2.0 * error_information(noise, mu, w.image[p], U(p)))
+                w.score[p] = w.weight[p] * c
+                w.ratio[p] = w.score[p] * c
+            start, stop = next_run(w, j, stop)
+
+
+@leaf()
+def _trace(q, a, group):
+    """Tr Q A of symmetric matrices that are stored as A is."""
+    out = 0.0
+    for i in range(group.lead.size):
+        for j in range(group.start[i] + group.lead[i], group.start[i] + i):
+            out += 2.0 * q[j] * a[j]
+        out += q[group.start[i] + i] * a[group.start[i] + i]
+    return out
+
+
+@leaf()
+def _entry(matrix, group, i, j):
+    return matrix[group.start[max(i, j)] + min(i, j)]
+
+
+@leaf()
+def _trace_of_square(q, b, group, templates):
+    """Tr Q B Q B of every source's own blocks."""
+    out = 0.0
+    for first in range(0, group.lead.size, templates):
+        for i in range(first, first + templates):
+            for j in range(first, first + templates):
+                forth, back = 0.0, 0.0
+                for k in range(first, first + templates):
+                    forth += _entry(q, group, i, k) * _entry(b, group, k, j)
+                    back += _entry(q, group, j, k) * _entry(b, group, k, i)
+                out += forth * back
+    return out
+
+
+@shared()
+def _lost(frame, noise, w, background, profiled):
+    """What fluxes and shifts take of the information about the model error: they fit residuals.
+
+    The information of the restricted likelihood is Tr (P V')^2 / 2, where V' = c V are the
+    variances' derivatives and P = V^-1 - V^-1 T H^-1 T^T V^-1. With A = T^T (c^2 / V) T and B = T^T
+    (c / V) T it is that of the pixels less Tr H^-1 A - Tr (H^-1 B)^2 / 2. The second trace is that
+    of single sources: those that overlap have little of it in common.
+
+    References
+    ----------
+    H. D. Patterson, R. Thompson, Biometrika 58, 545 (1971).
+    """
+    lost = 0.0
+    if profiled is not None:
+        touching = profiled.touching
+        clusters, templates = touching.clusters, touching.stamps.shape[0]
+        at = row_starts(touching.footprints, w.image.size // w.span.shape[0])
+        _weigh_by_error(frame, noise, w, background)
+        for c in range(clusters.first.size - 1):
+            group = one_cluster(clusters, c, templates)
+            q = invert(profiled.factors[clusters.begin[c] : clusters.begin[c + 1]], group)
+            products = np.empty(q.size)
+            gram(touching, group, w.ratio, at, products)
+            lost += _trace(q, products, group)
+            gram(touching, group, w.score, at, products)
+            lost -= 0.5 * _trace_of_square(q, products, group, templates)
+    return lost
+
+
+def _none_lost(noise, frame, w, background, profiled):
+    return 0.0
+
+
+def _some_lost(noise, frame, w, background, profiled):
+    return _lost(frame, noise, w, background, profiled)
+
+
+_lost_to_sources = by_exactness(_none_lost, _some_lost)
+
+
 @entry()
 def fisher(problem, w, rendered, parameters, basis, out):
     """Fisher information of source parameters, then of as many background coefficients as fit.
@@ -207,4 +298,5 @@ def fisher(problem, w, rendered, parameters, basis, out):
     for k in range(size):
         for m in range(k):
             out[m, k] = out[k, m]
-    return known, known_error
+    lost = _lost_to_sources(noise, frame, w, background, profiled)
+    return known, known_error - min(lost, MOST_LOST * known_error)
