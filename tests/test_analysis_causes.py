@@ -112,6 +112,7 @@ def test_an_uneven_background_is_stated_without_its_noise(steepness: float) -> N
     assert stated == pytest.approx(slope.std(), rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 1.4])
 def test_the_verdict_says_of_a_large_model_error_that_it_is_one(factor: float) -> None:
     """A model that needs it fits the counts, and nothing else would tell of the PSF."""

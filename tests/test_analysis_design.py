@@ -541,6 +541,7 @@ def test_flat_priors_and_a_single_source() -> None:
     assert png(design_plot(alone))[1:4] == b"PNG"
 
 
+@pytest.mark.slow
 def test_footprints_and_scatter() -> None:
     """Footprints follow the images, and positions that scatter make sources tell less."""
     posterior, params = small(nuisances=bf.Nuisances(footprint=8.0))

@@ -132,6 +132,7 @@ def test_robust_errors_of_a_true_model_where_positions_scatter(
     assert np.mean(ratios) == pytest.approx(expected, abs=0.05)
 
 
+@pytest.mark.slow
 def test_robust_errors_with_a_measured_psf_are_the_plain_ones_of_a_true_model() -> None:
     """Of 81 sources one is uncertain by 0.08, the mean of three frames by 0.05.
 
@@ -172,6 +173,7 @@ def test_coverage_of_200_frames(nuisances: dict[str, Any], record_property: Any)
     assert ratio.mean() == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_what_no_scatter_tells_is_nan() -> None:
     one = frame(0.0, 1, side=1)
     covariance = np.diag(np.full(one.n_parameters, 1e-6))

@@ -98,7 +98,8 @@ def draws(best: MapEstimate, sd: float) -> Floats:
 
 # what costs most to compile is among the long runs
 LONG = {"nuisances", "Moffat", "scattered, model error"}
-NAMES = [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in CASES]
+COSTLY = dict.fromkeys(LONG, pytest.mark.long) | {"scattered": pytest.mark.slow}
+NAMES = [pytest.param(name, marks=COSTLY.get(name, ())) for name in CASES]
 
 
 @pytest.mark.parametrize("case", NAMES)

@@ -215,7 +215,10 @@ EXTREMES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("case", EXTREMES)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=pytest.mark.slow if "map" in case else ()) for case in EXTREMES],
+)
 def test_wide_frames_and_extreme_pixels_are_summed_pixel_by_pixel(case: str) -> None:
     sources = SourceCatalog(np.arange(-500.0, 501.0, 50.0), np.zeros(21), np.full(21, 3e3))
     distortion = PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)])

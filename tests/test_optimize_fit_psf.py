@@ -368,6 +368,7 @@ def test_what_a_psf_adds_is_that_of_a_joint_fit():
     assert not np.any(scale.covariance[2]) and np.all(np.diag(scale.covariance)[:2] > 0.0)
 
 
+@pytest.mark.slow
 def test_what_a_psf_shares_with_parameters_is_the_slope_of_their_gradient():
     """Of counts without noise, whose residuals do not change with the PSF's slopes."""
     _, _, posterior = frame_of(bf.MoffatPSF(3.0, 4.765), 3.0, side=4)

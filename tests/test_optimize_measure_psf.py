@@ -36,6 +36,7 @@ def frame_with_ghosts(seed: int, flux: float, width: float) -> bf.Posterior:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "flux", "width"), [(1, 3e5, 2.5), (2, 3e5, 2.5), (1, 1e6, 2.5), (1, 1e6, 4.0)]
 )

@@ -200,6 +200,7 @@ def test_splines_are_the_derivatives_of_the_light():
     assert abs(np.sort(light[light != 0.0]) - np.sort(expected)).max() < 1e-8 * np.abs(light).max()
 
 
+@pytest.mark.slow
 def test_it_does_not_matter_where_the_first_psf_stopped():
     """Another PSF that does not vary and another background lead to the same places.
 
