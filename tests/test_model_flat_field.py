@@ -38,12 +38,6 @@ READ_NOISES: dict[str, Any] = {
     "2": 2.0,
     "map": RNG.uniform(1.0, 3.0, SHAPE),
 }
-CASES = [
-    "none",
-    pytest.param("0.4", marks=pytest.mark.slow),
-    "2",
-    pytest.param("map", marks=pytest.mark.slow),
-]
 
 
 def frame(case: str, nuisances: Nuisances, flat: Floats = FLAT) -> tuple[bf.Posterior, Floats]:
@@ -55,7 +49,8 @@ def frame(case: str, nuisances: Nuisances, flat: Floats = FLAT) -> tuple[bf.Post
     return make_posterior(model, truth, rng, nuisances, noise, mask=mask)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", READ_NOISES)
 def test_log_prob_is_that_of_the_recorded_counts(case: str) -> None:
     posterior, params = frame(case, Nuisances("scale", offset=True))
     recorded, plain = posterior.counts * FLAT, bf.PoissonNoise(READ_NOISES[case])
@@ -73,12 +68,13 @@ def test_log_prob_is_that_of_the_recorded_counts(case: str) -> None:
     assert posterior.log_prob(params) == -math.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "nuisances"),
     [
         ("none", Nuisances("scale", offset=True)),
-        pytest.param("2", Nuisances(background_order=1), marks=pytest.mark.slow),
-        pytest.param("map", Nuisances("scale", psf_sigma=True), marks=pytest.mark.slow),
+        ("2", Nuisances(background_order=1)),
+        ("map", Nuisances("scale", psf_sigma=True)),
         pytest.param("none", Nuisances("free", offset=True), marks=pytest.mark.long),
         pytest.param("2", Nuisances(model_error=True), marks=pytest.mark.long),
     ],
@@ -95,7 +91,8 @@ def test_gradient_is_that_of_log_prob(case: str, nuisances: Nuisances) -> None:
     )
 
 
-@pytest.mark.parametrize("case", ["none", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["none", "2"])
 def test_fisher_is_that_of_the_dense_jacobian(case: str) -> None:
     posterior, params = frame(case, Nuisances("scale", offset=True))
     scale = np.outer(errors(posterior, params), errors(posterior, params))
@@ -108,6 +105,7 @@ def test_fisher_is_that_of_the_dense_jacobian(case: str) -> None:
     assert flat.fisher_weight(mean, 0.0) == pytest.approx([0.5 / 0.05, 1.5 / 5.0])
 
 
+@pytest.mark.slow
 def test_a_constant_response_is_a_longer_exposure() -> None:
     flat = np.full(SHAPE, 0.7)
     posterior, params = frame("none", Nuisances("scale"), flat)
@@ -124,6 +122,7 @@ def test_a_constant_response_is_a_longer_exposure() -> None:
     assert ours == pytest.approx(theirs, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_a_masked_pixel_is_said_to_respond_is_irrelevant() -> None:
     posterior, params = frame("none", Nuisances())
     other = np.where(posterior.mask, FLAT, 77.0)
@@ -226,6 +225,7 @@ def covered(z: Floats) -> float:
     return float(np.abs(share - 0.6827).max() / math.sqrt(0.6827 * 0.3173 / len(z)))
 
 
+@pytest.mark.slow
 def test_a_frame_whose_flat_field_is_ignored_does_not_fit() -> None:
     # the negative control of the next test; with the flat field, 5 sd have a probability of 1e-6
     _, off, _ = refits(4, ignored=False)

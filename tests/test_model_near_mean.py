@@ -36,7 +36,7 @@ NOISES: dict[str, Any] = {
     "flat, 2": bf.FlatFieldNoise(READ(2.0), FLAT),
     "flat, map": bf.FlatFieldNoise(READ(MAP), FLAT),
 }
-LONG = {"0.5", "below 1", "around 1", "flat, map"}
+LONG = {"0.5", "below 1", "around 1", "flat, 2", "flat, map"}
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in NOISES]
 
 

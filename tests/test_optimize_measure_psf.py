@@ -89,6 +89,7 @@ def test_a_wrong_background_is_no_error_of_the_light():
     assert likely_error(residual[1000:], variance[1000:], light[1000:]) == 0.0
 
 
+@pytest.mark.slow
 def test_a_psf_that_leaves_much_should_vary_more():
     posterior = frame_with_ghosts(1, 3e5, 2.5)
     known = dict(zip(posterior.parameter_names, bf.find_map(posterior).params, strict=True))
