@@ -143,12 +143,13 @@ def test_scattered_positions_get_a_nested_approximation() -> None:
 class Scaled(TargetDensity):
     """Twenty normal parameters around zero whose deviation is the product of scales.
 
-    Given the others a scale is normal around one. The information is `overstated` times what minus
-    the Hessian says at the maximum.
+    Given the others a scale is normal around one, the first one as far as `largest`. The
+    information is `overstated` times what minus the Hessian says at the maximum.
     """
 
     scales: tuple[str, ...]
     overstated: float = 1.3
+    largest: float = np.inf
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
@@ -161,7 +162,9 @@ class Scaled(TargetDensity):
     @property
     def support(self) -> tuple[Floats, Floats]:
         low = np.repeat([-np.inf, 0.0], [20, len(self.scales)])
-        return low, np.full(low.size, np.inf)
+        high = np.full(low.size, np.inf)
+        high[20] = self.largest
+        return low, high
 
     def log_prob(self, params: npt.ArrayLike) -> Any:
         x, scales = np.split(np.asarray(params), [20], axis=-1)
@@ -169,7 +172,8 @@ class Scaled(TargetDensity):
             deviation = scales.prod(axis=-1)
             own = -20.0 * np.log(deviation) - 0.5 * (x**2).sum(axis=-1) / deviation**2
             out = own - 0.5 * ((scales - 1.0) ** 2).sum(axis=-1) / WIDTH**2
-        return np.where((scales > 0.0).all(axis=-1), out, -np.inf)
+        inside = (scales > 0.0).all(axis=-1) & (scales[..., 0] <= self.largest)
+        return np.where(inside, out, -np.inf)
 
     def gradient(self, params: npt.ArrayLike) -> Floats:
         x, scales = np.split(np.asarray(params), [20])
@@ -208,3 +212,13 @@ def test_scales_and_errors_are_those_of_the_posterior(scales: tuple[str, ...]) -
     assert usable(move, density) > 0.8
     # negative control: the information and the maximum alone
     assert usable(LaplaceMove(estimate.params, estimate.covariance), density) < 0.5
+
+
+@pytest.mark.parametrize("largest", [1.2, 1.05, 0.95])  # the maximum is at 0.92
+def test_a_scatter_is_nested_as_far_as_its_prior_goes(largest: float) -> None:
+    density = Scaled(SCALES, largest=largest)
+    move = LaplaceMove.of(density, density.estimate)
+    scatters = move.means[:, list(move.order).index(20)]
+    assert 0.97 * largest < scatters.max() < largest
+    # 0.01 of it Monte Carlo error; approximations beyond the prior, drawn to its edge, had 0.003
+    assert usable(move, density) > 0.6

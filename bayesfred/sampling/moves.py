@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from emcee.moves import RedBlueMove
+from scipy.interpolate import make_interp_spline
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.special import gammaln, logsumexp, ndtr
 from scipy.stats import norm, truncnorm
@@ -26,6 +27,8 @@ HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
 
 NESTED = 30  # approximations to either side, at most
+APART = 4  # of them from one to the next that is not interpolated, at most
+SMOOTH = 0.4  # ... and how far they may be apart in log tau for that
 NEGLIGIBLE = 7.0  # in log weight below the largest: e^-7 = 1e-3
 
 WIDEST = 2.0  # correction of variances for which the posterior still is about normal
@@ -368,19 +371,43 @@ def _nested(
     See `LaplaceMove.of`; `width` times the distance between its values is its standard deviation.
     """
     j = posterior.parameter_names.index(posterior.hyperparameters[0])
-    ratio = 0.5 * np.sqrt(covariance[j, j]) / params[j]
-    means, covariances = [], []
-    logs: list[float] = []
-    for outward in (range(NESTED), range(-1, -NESTED, -1)):
-        for k in outward:
-            at = params.copy()
-            at[j] *= np.exp(k * ratio)
-            mean, given, value = _given(posterior, at, covariance, scales, j)
-            given[j, j] = (ratio * mean[j] * width) ** 2
-            log = value + 0.5 * np.linalg.slogdet(given)[1]
-            if not log > max(logs, default=-np.inf) - NEGLIGIBLE:
-                break
-            means.append(mean)
-            covariances.append(given)
-            logs.append(log)
-    return np.array(means), np.array(covariances), np.exp(np.array(logs) - logsumexp(logs))
+    ratio, (low, high) = 0.5 * np.sqrt(covariance[j, j]) / params[j], posterior.support
+    known: dict[int, tuple[Floats, Floats, float]] = {}
+
+    def nest(k: int) -> float:
+        at = params.copy()
+        at[j] *= np.exp(k * ratio)
+        if not low[j] <= at[j] <= high[j]:
+            return -np.inf
+        mean, given, value = _given(posterior, at, covariance, scales, j)
+        given[j, j] = (ratio * mean[j] * width) ** 2
+        log = value + 0.5 * float(np.linalg.slogdet(given)[1])
+        try:
+            lower = cholesky(given, lower=True)
+        except (LinAlgError, ValueError):
+            return -np.inf
+        if np.isfinite(log):
+            known[k] = mean, lower, log
+        return log
+
+    top, most = nest(0), min(APART, max(1, int(SMOOTH / ratio)))
+    if not known:
+        return params[None], covariance[None], np.ones(1)
+    for outward in (1, -1):
+        k, apart, log = 0, most, top
+        while apart and k < NESTED and log > top - NEGLIGIBLE:
+            log = nest(outward * (k + apart))
+            if np.isfinite(log):
+                k += apart
+            else:
+                apart, log = apart // 2, top
+    at = sorted(known)
+    every = np.arange(at[0], at[-1] + 1)
+    means, lowers, logs = (
+        make_interp_spline(at, np.array(values), k=min(3, len(at) - 1))(every)
+        for values in zip(*(known[k] for k in at), strict=True)
+    )
+    means[:, j] = params[j] * np.exp(ratio * every)
+    some = logs > logs.max() - NEGLIGIBLE
+    covariances = lowers[some] @ lowers[some].transpose(0, 2, 1)
+    return means[some], covariances, np.exp(logs[some] - logsumexp(logs[some]))

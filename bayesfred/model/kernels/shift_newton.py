@@ -43,7 +43,7 @@ from bayesfred.model.kernels.patches import weigh_patch
 STILL = 1e-8
 STILL_EARLY = 3e-6  # where the search ends early
 LONGEST = 8.0  # Newton steps in one
-CLOSE = 1e-16  # square of the distance from the maximum, in standard deviations
+CLOSE = 1e-16  # square of a distance from the maximum, in standard deviations, for every source
 VAGUE = 0.2  # of a change of log det H, since e depends on the parameters
 PATIENT, HALVES = 10, 8  # visits before steps are only taken uphill; how often one is halved
 CERTAIN = 0.01  # square of the distance from which on they are anyway
@@ -268,7 +268,8 @@ def maximize(frame, parameters, cluster, known, h):
     """
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
     size, noise = touching.stamps.shape[0], given(frame.noise, parameters)
-    exact, early, enough = exact_weight(noise), known.nearby.e.size > 0, ENOUGH * group.members.size
+    exact, early = exact_weight(noise), known.nearby.e.size > 0
+    close, enough = CLOSE * group.members.size, ENOUGH * group.members.size
     step, lower = np.zeros(group.lead.size), h.copy() if size > 1 else h
     distance, rate, converged = 0.0, 1.0, False
     shares, distances = np.ones(group.members.size), np.zeros(group.members.size)
@@ -292,7 +293,7 @@ def maximize(frame, parameters, cluster, known, h):
         # the square of the distance in standard deviations, and what a step leaves of it
         before, distance = distance, np.dot(gradient, step)
         rate = distance / before if before > 0.0 else 1.0
-        if fresh and distance <= CLOSE:
+        if fresh and distance <= close:
             return 0.0 if size == 1 or cholesky(h, group) else math.nan
         for i in range(shares.size):
             own = slice(i * size, (i + 1) * size)
@@ -312,5 +313,5 @@ def maximize(frame, parameters, cluster, known, h):
             way = step, shares
             value = _turn_back(frame, parameters, cluster, way, value)
         left = distance * min(rate, 1.0)
-        converged = left <= CLOSE or (early and 0.5 * left * math.sqrt(rate) <= enough)
+        converged = left <= close or (early and 0.5 * left * math.sqrt(rate) <= enough)
     return math.nan
