@@ -489,6 +489,31 @@ def test_footprint_keeps_pixels_near_sources(detector: Detector) -> None:
     assert np.array_equal(posterior.mask, mask & np.any(near, axis=0))
 
 
+@pytest.mark.parametrize("nuisances", [Nuisances(), Nuisances("free", offset=True)])
+def test_pixels_beyond_the_mask_are_left_out_of_the_likelihood_alone(nuisances: Nuisances) -> None:
+    rng = np.random.default_rng(16)
+    model = make_model()
+    u, v = np.meshgrid(*model.detector.pixel_centres())
+    x, y = model.sources.x, model.sources.y
+    near = np.any([np.hypot(u - a, v - b) < 5.0 for a, b in zip(x, y, strict=True)], axis=0)
+    # rows through a source beside its middle, and all of the middle of another
+    mask = near & (np.abs(v - y[0] - 3.0) > 1.0) & (np.hypot(u - x[1], v - y[1]) > 2.0)
+    posterior, truth = make_posterior(model, make_truth(model, rng), rng, nuisances, mask=mask)
+    if nuisances.flux == "fixed":
+        expected, scale = dense_log_prob(posterior, truth)
+        assert posterior.log_prob(truth) == pytest.approx(expected, abs=1e-14 * scale, rel=1e-12)
+    likelihood = posterior.likelihood
+    with likelihood.expected(truth) as whole:
+        fluxes, light = whole.fluxes.copy(), whole.light.copy()
+    found = likelihood._found(truth[None])[0, :, 0]
+    assert found == pytest.approx(fluxes, rel=1e-9)
+    named = dict(zip(posterior.parameter_names, truth, strict=True))
+    sources = dataclasses.replace(model.sources, flux=fluxes)
+    dense = dense_image(dataclasses.replace(model, sources=sources), named)
+    assert light == pytest.approx(dense, abs=1e-9 * dense.max())
+    assert light[~mask].max() > 0.1 * dense.max()  # pictures show it
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -201,7 +201,7 @@ class FrameLikelihood:
     def expected(self, params: Floats) -> Iterator[Expected]:
         """Expected counts in the memory where they are rendered, which then serves others again."""
         ny, nx = self.model.detector.shape
-        with self._rendered(params, to_the_bit=False) as (w, rendered, parameters):
+        with self._rendered(params, whole=True) as (w, rendered, parameters):
             bad = 0.0 if rendered.extra > -np.inf else np.nan
             level = polynomial_background(self.mask.shape, parameters.background + bad)
             yield Expected(w.image.reshape(ny, -1)[:, :nx], level, rendered.fluxes + bad)
@@ -228,7 +228,7 @@ class FrameLikelihood:
         InputError
             Where the likelihood is zero because the map folds.
         """
-        with self._rendered(params) as (w, rendered, parameters):
+        with self._rendered(params, whole=True) as (w, rendered, parameters):
             if not rendered.extra > -np.inf:
                 raise InputError(
                     "params: got parameters that leave a source without an image, expected ones "
@@ -326,15 +326,15 @@ class FrameLikelihood:
         return chain_rule(self.parameters, params, self.model.polynomial, self._moving)
 
     @contextmanager
-    def _rendered(self, params: Floats, to_the_bit: bool = True) -> Iterator[Evaluation]:
-        """A workspace in which the sources are rendered, for one parameter vector."""
-        parameters = self._one(params)
+    def _rendered(self, params: Floats, whole: bool = False) -> Iterator[Evaluation]:
+        """A workspace in which the sources are rendered, on all pixels or where they count."""
+        problem, parameters = self._problem, self._one(params)
         with self._workspaces.one() as w:
-            if to_the_bit and self._last.missing(params):  # the same whatever came before
-                self._last.keep_rendered(params, render(self._problem, w, parameters, NOTHING))
+            if not whole and self._last.missing(params):  # to the bit the same whatever came before
+                self._last.keep_rendered(params, render(problem, w, parameters, NOTHING, False))
                 clear(w)
             known = NOTHING._replace(start=self._last.at(params))
-            yield w, render(self._problem, w, parameters, known), parameters
+            yield w, render(problem, w, parameters, known, whole), parameters
             clear(w)
 
     @cached_property

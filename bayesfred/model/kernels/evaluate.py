@@ -7,13 +7,19 @@ import numpy as np
 from bayesfred.imaging.kernels.compilation import entry, inner
 from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import take_turn
-from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, row_starts
+from bayesfred.imaging.kernels.geometry import (
+    find_footprints,
+    layout_of,
+    locate,
+    new_geometry,
+    row_starts,
+)
 from bayesfred.imaging.kernels.render import add_sources
 from bayesfred.model.kernels.clusters import bounding_boxes, find_clusters
 from bayesfred.model.kernels.contexts import Known, Profiled, Rendered, Touching, parameters_of
 from bayesfred.model.kernels.extrapolate import profile_extrapolated
 from bayesfred.model.kernels.fluxes import profile
-from bayesfred.model.kernels.likelihood import clear, log_likelihood, mark, room
+from bayesfred.model.kernels.likelihood import clear, counted, log_likelihood, mark, room
 
 
 @inner()
@@ -40,10 +46,10 @@ def _fill_image(problem, layout, w, parameters, known, free):
 
 
 @entry()
-def render(problem, w, parameters, known):
+def render(problem, w, parameters, known, whole):
     """Render all sources, profiling their fluxes if they are free.
 
-    The caller clears the workspace.
+    On all pixels, or on no more than the likelihood needs. The caller clears the workspace.
     """
     o, nuisances = problem.optics, parameters.nuisances
     geometry = new_geometry(o)
@@ -51,7 +57,8 @@ def render(problem, w, parameters, known):
     if not (nuisances.position_scatter >= 0.0 and locate(o, parameters.theta, nuisances, geometry)):
         extra = -math.inf
         geometry.rows[:] = 0
-    layout = lay_out(o, geometry, nuisances.psf_sigma)
+    fp = find_footprints(o, geometry) if whole else counted(problem.frame, o, geometry)
+    layout = layout_of(o, geometry, fp, nuisances.psf_sigma)
     mark(problem.frame, layout.footprints, w)
     more, fluxes, profiled = _fill_image(problem, layout, w, parameters, known, problem.free)
     return Rendered(extra + more, geometry, layout.footprints, fluxes, profiled)
@@ -81,7 +88,7 @@ def log_likelihoods(problem, w, vectors, turns):
         if out[i] > -math.inf:
             parameters = parameters_of(vectors, i)
             known = Known(turns.start[i], turns.nearby)
-            rendered = render(problem, w, parameters, known)
+            rendered = render(problem, w, parameters, known, False)
             value = rendered.extra
             if value > -math.inf:
                 value += log_likelihood(problem.frame, w, parameters)

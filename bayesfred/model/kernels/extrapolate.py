@@ -24,12 +24,19 @@ from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner, leaf
 from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
-from bayesfred.imaging.kernels.geometry import lay_out, locate, new_geometry, row_starts
+from bayesfred.imaging.kernels.geometry import layout_of, locate, new_geometry, row_starts
 from bayesfred.imaging.kernels.render import add_source
 from bayesfred.model.kernels.clusters import bounding_boxes, cholesky, one_cluster, solve
 from bayesfred.model.kernels.contexts import Clusters
 from bayesfred.model.kernels.expansion import OVERLAP, own_run, pair, shared_run, single
-from bayesfred.model.kernels.likelihood import U, log_likelihood, mark, room, weigh_rows
+from bayesfred.model.kernels.likelihood import (
+    U,
+    counted,
+    log_likelihood,
+    mark,
+    room,
+    weigh_rows,
+)
 from bayesfred.model.kernels.noise_dispatch import given
 
 BAND = 16  # rows visited at a time
@@ -253,8 +260,8 @@ def profile_extrapolated(problem, w, parameters, fluxes, known):
         return -math.inf
     if not _are_positive(fluxes):
         return math.nan
-    layout = lay_out(o, geometry, nuisances.psf_sigma)
-    fp, clusters = layout.footprints, known.clusters
+    fp, clusters = counted(frame, o, geometry), known.clusters
+    layout = layout_of(o, geometry, fp, nuisances.psf_sigma)
     mark(frame, fp, w)
     visit = _Visit(
         layout,

@@ -12,7 +12,7 @@ import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
-from bayesfred.imaging.kernels.contexts import SEGMENT, Optics, SourceNuisances
+from bayesfred.imaging.kernels.contexts import LANES, SEGMENT, Optics, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
 from bayesfred.model.kernels.contexts import LIMIT, STRETCH, Unreached, Workspace
@@ -77,6 +77,42 @@ def count_samples(o, nuisances):
 def room(w, first, size):
     """A part of the workspace's heap, or new memory where it is too small."""
     return w.heap[first : first + size] if first + size <= w.heap.size else np.empty(size)
+
+
+@inner()
+def counted(frame, o, geometry):
+    """The sources' footprints, without pixels at the ends of their rows that are masked."""
+    fp = find_footprints(o, geometry)
+    if frame.pixels < o.ny * o.nx:
+        _trim(frame.values, o, geometry.peak, fp)
+    return fp
+
+
+@shared()
+def _trim(values, o, peaks, fp):
+    """Shorten the footprints' rows to the pixels that count.
+
+    A source whose middle is masked keeps all: how much of it is seen tells where the search for its
+    flux begins. A source's rows follow each other, so those that do not count stay between others.
+    """
+    pitch, start = values.size // o.ny, 0
+    for s in range(peaks.shape[0]):
+        j = round(peaks[s, 1] / o.step + 0.5 * (o.ny - 1))
+        i = round(peaks[s, 0] / o.step + 0.5 * (o.nx - 1))
+        inside = 0 <= j < o.ny and 0 <= i < o.nx and values[j * pitch + i] > LIMIT
+        for p in range(fp.first[s], fp.first[s + 1]):
+            low, size = fp.low[p], fp.size[p]
+            a, b = fp.row[p] * pitch + low, fp.row[p] * pitch + low + size
+            while inside and a < b and values[a] <= LIMIT:
+                a += 1
+            while inside and a < b and values[b - 1] <= LIMIT:
+                b -= 1
+            n = max(-(-(b - a) // LANES), 1) * LANES
+            fp.low[p] = min(a - fp.row[p] * pitch, low + size - n)
+            fp.size[p] = n
+            fp.start[p] = start
+            start += n
+    fp.start[fp.row.size] = start
 
 
 @shared()
