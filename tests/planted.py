@@ -110,6 +110,30 @@ def over_dispersion(seed: int) -> Posterior:
     return Posterior(model, rng.poisson(flat * model.expected_counts(THETA, 100.0)).astype(float))
 
 
+def colour_filter(seed: int) -> Posterior:
+    """A raw frame of a colour camera: red, green, green and blue pixels."""
+    model = camera(field(seed))
+    response = np.ones(SHAPE)
+    response[::2, ::2], response[1::2, 1::2] = 0.6, 0.5
+    rng = np.random.default_rng(seed + 20_000)
+    expected = response * model.expected_counts(THETA, LEVEL)
+    return Posterior(model, rng.poisson(expected).astype(float), nuisances=Nuisances("free"))
+
+
+def two_amplifiers(seed: int) -> Posterior:
+    """Every other column is read by an amplifier that adds 4 counts."""
+    posterior = true(seed)
+    more = np.where(np.arange(SHAPE[1]) % 2 == 1, 4.0, 0.0)
+    return replace(posterior, counts=posterior.counts + more)
+
+
+def narrow_psf_on_grid(seed: int) -> Posterior:
+    """Sources, all in even rows and columns, are wider than 0.6 pixels."""
+    model = camera(SourceCatalog.grid(15, 8.0, 2e4), psf=GaussianPSF(0.6))
+    wider = replace(model, psf=GaussianPSF(0.7))
+    return Posterior(model, simulate(wider, 0.05 * THETA, LEVEL, seed=seed + 10_000))
+
+
 def background(seed: int) -> Posterior:
     """The background is twice as high on one side as on the other."""
     model = camera(field(seed))
@@ -297,6 +321,8 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "read noise": (read_noise, ("read noise",)),
     "pedestal": (pedestal, ("pedestal",)),
     "over-dispersion": (over_dispersion, ("over-dispersion",)),
+    "colour filter": (colour_filter, ("alternating pixels",)),
+    "two amplifiers": (two_amplifiers, ("alternating pixels",)),
     "background": (background, ("background",)),
     "origin": (origin, ("origin",)),
     "parity": (parity, ("parity",)),
@@ -321,4 +347,5 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "PSF too wide": (wide_psf, ("PSF",)),
     "PSF with wings": (moffat_psf, ("PSF",)),
     "pixels taken for points": (undersampled, ("PSF",)),
+    "PSF too narrow, on a grid": (narrow_psf_on_grid, ("PSF",)),
 }

@@ -46,12 +46,15 @@ class Context:
         Pixels that an earlier cause has explained.
     rejected : bool
         Whether outliers were rejected already.
+    corrected : ndarray, shape (ny, nx), optional
+        Expected counts with what an earlier cause has explained.
     """
 
     posterior: Posterior
     params: Floats
     left_out: Flags
     rejected: bool = False
+    corrected: Floats | None = None
 
     @cached_property
     def light(self) -> SourceLight:
@@ -61,6 +64,8 @@ class Context:
     @cached_property
     def expected(self) -> Floats:
         """Expected counts, shape (ny, nx)."""
+        if self.corrected is not None:
+            return self.corrected
         return self.posterior.expected_counts(self.params)
 
     @cached_property

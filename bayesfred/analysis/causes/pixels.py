@@ -1,4 +1,4 @@
-"""Hypotheses about pixels: saturation, the noise's variance, the background."""
+"""Hypotheses about pixels: saturation, colour filters, the noise's variance, the background."""
 
 import math
 from collections.abc import Iterator
@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.causes.cause import Cause, Finding
+from bayesfred.analysis.causes.common import common_pattern
 from bayesfred.analysis.causes.context import Context
 from bayesfred.model.noise import PoissonNoise
 
@@ -74,6 +75,43 @@ def saturation(context: Context) -> tuple[Finding | None, Flags]:
         "mask them: set frame.saturation",
     )  # fmt: skip
     return Finding(cause, explained, "saturation"), np.asarray(spoiled & context.posterior.mask)
+
+
+def alternation(context: Context) -> tuple[Finding | None, Floats]:
+    """Even and odd rows and columns that differ, and the counts that are expected if they do.
+
+    Pixels of a colour camera, behind filters, record other shares of the light; where rows or
+    columns are read by amplifiers of their own, other constants are added.
+    """
+    ny, nx = context.expected.shape
+    kind = np.arange(ny)[:, None] % 2 * 2 + np.arange(nx) % 2
+    found, best = None, context.expected
+    for of_light, unit in ((True, context.expected), (False, np.ones(kind.shape))):
+        t = np.where(context.used, unit / np.sqrt(context.variance), 0.0)
+        pull, power = (np.bincount(kind.ravel(), (t * each).ravel(), 4) for each in (context.z, t))
+        size = pull / np.maximum(power, 1e-300)
+        explained = float(pull @ size - pull.sum() ** 2 / max(power.sum(), 1e-300)) - 3.0
+        if explained > max(NOTICEABLE * 6.0**0.5, found.explained if found else 0.0):
+            found = Finding(_alternating(size, of_light), explained, "alternation")
+            best = context.expected + size[kind] * unit
+    if found is not None:
+        # of sources on a regular grid a wrong PSF favours even pixels, too
+        shared = common_pattern(context, (0, 2))
+        if shared is not None and shared.explained > found.explained:
+            return None, context.expected
+    return found, best
+
+
+def _alternating(size: Floats, of_light: bool) -> Cause:
+    a, b, c, d = (f"{1.0 + x:.3f}" if of_light else f"{x:+.2g}" for x in size)
+    what = "times the model's counts" if of_light else "counts more than the model has"
+    return Cause(
+        "alternating pixels", 0.0,
+        f"even and odd rows and columns differ: pixels of even rows hold {a} (even columns) and "
+        f"{b} (odd ones) {what}, those of odd rows {c} and {d}; the first row and column are even",
+        "take the pixels of one colour if the camera has a colour filter, or set frame.flat to "
+        "the relative response of every pixel" if of_light else "subtract a dark frame first",
+    )  # fmt: skip
 
 
 def background_and_noise(context: Context) -> Iterator[Finding]:
