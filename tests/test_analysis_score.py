@@ -316,6 +316,27 @@ def test_wrong_sources_are_listed() -> None:
     assert "rows of the catalogue, from 0: 48 at x, y = 51.0, 51.0" in verdict.sentence
 
 
+@pytest.mark.parametrize(("are_bright", "wider"), [(True, 1.01), (False, 1.03)])
+def test_the_brightest_sources_tell_of_the_psf(are_bright: bool, wider: float) -> None:
+    """Six images are wider: of the brightest, or, as the negative control, of any."""
+    nuisances = Nuisances("free", psf_sigma=True)
+    for seed in (8, 9):
+        rng = np.random.default_rng(seed)
+        flux = rng.permutation(np.geomspace(3e3, 3e5, 49))
+        six = (flux if are_bright else rng.random(49)).argsort()[-6:]
+        narrow = replace(stars(), sources=replace(stars().sources, flux=flux))
+        s = narrow.sources
+        some = SourceCatalog(s.x[six], s.y[six], flux[six])
+        expected = 5.0 + narrow.expected_counts(np.zeros(12))
+        for sign, width in ((-1.0, 1.0), (1.0, wider)):
+            model = replace(narrow, sources=some, psf=GaussianPSF(width * SIGMA))
+            expected += sign * model.expected_counts(np.zeros(12))
+        counts = rng.poisson(np.maximum(expected, 0.0))
+        verdict, _, _ = judged(Posterior(narrow, counts, nuisances=nuisances))
+        assert verdict.causes[0].name == ("PSF" if are_bright else "wrong sources")
+        assert ("they are bright" in verdict.sentence) == are_bright
+
+
 # --- calibration ----------------------------------------------------------------------------------
 
 TRUE = {

@@ -104,7 +104,7 @@ def judge_fit(
         failures = _failures(residuals)
         if not consist:
             causes = find_causes(posterior, params, rejected=rejected)
-        causes = causes or hidden_causes(posterior, residuals.scores, residuals.tests)
+        causes = causes or hidden_causes(posterior, params, residuals.scores, residuals.tests)
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
     if fits and not estimate.fits_data:

@@ -11,8 +11,9 @@ so many numbers if they scattered by what the terms leave. Scatter explains the 
 from dataclasses import replace
 
 import numpy as np
+from scipy import stats
 
-from bayesfred._typing import Ints
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.causes.cause import (
     RICHER,
     Cause,
@@ -29,6 +30,7 @@ from bayesfred.imaging.monomials import degree_of
 from bayesfred.model.posterior import Posterior
 
 NOISE = 2.0  # standard deviations by which a spread has to explain more than chance
+BY_CHANCE = 1e-4  # that so many of the brightest are among few sources
 MORE_TERMS = ("missing terms", "")
 # The cause, and what frees a number that a score test finds wrong, by the beginning of its name.
 REMEDIES = {
@@ -53,13 +55,14 @@ SPREADS = {
 
 
 def hidden_causes(
-    posterior: Posterior, scores: ScoreTests, tests: SourceTests
+    posterior: Posterior, params: Floats, scores: ScoreTests, tests: SourceTests
 ) -> tuple[Cause, ...]:
     """The failed tests as causes.
 
     Parameters
     ----------
     posterior : Posterior
+    params : ndarray, shape (d,)
     scores : ScoreTests
     tests : SourceTests
 
@@ -81,7 +84,9 @@ def hidden_causes(
     if failed.size and few:
         # what no score describes shows in the chi-square
         held = np.maximum(own, squares[:, 0])[failed]
-        findings.append(_few_sources(posterior, failed[np.argsort(-held)], float(held.sum())))
+        bright = _are_bright(posterior.fluxes(params), tests.failed)
+        order = failed[np.argsort(-held)]
+        findings.append(_few_sources(posterior, order, float(held.sum()), bright))
     elif failed.size:
         profile = float(squares[:, [0, *KINDS["size and shape"]]].sum())
         text = f"{failed.size} of {own.size} sources do not look like the PSF"
@@ -137,15 +142,29 @@ def _terms(finding: Finding, leads: list[Lead], scores: ScoreTests, tests: Sourc
     return replace(finding, cause=replace(finding.cause, remedy=remedy), explained=explained)
 
 
-def _few_sources(posterior: Posterior, failed: Ints, explained: float) -> Finding:
-    """Sources that differ from the catalogue."""
+def _are_bright(fluxes: Floats, failed: Flags) -> bool:
+    """Whether sources that do not fit are brighter than the others."""
+    test = stats.mannwhitneyu(fluxes[failed], fluxes[~failed], alternative="greater")
+    return bool(test.pvalue < BY_CHANCE)
+
+
+def _few_sources(posterior: Posterior, failed: Ints, explained: float, are_bright: bool) -> Finding:
+    """Sources that differ from the catalogue, or the brightest, which show what all have wrong."""
     s = posterior.model.sources
     names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in failed[:NAMED])
     more = ", ..." if failed.size > NAMED else ""
+    rows = f"rows of the catalogue, from 0: {names}{more}"
+    if are_bright:
+        cause = Cause(
+            "PSF", 0.0,
+            f"{failed.size} of {len(s)} sources do not fit, and they are bright: what is slightly "
+            f"wrong with all shows there first: {rows}",
+            psf_remedy(posterior, 'measure the PSF (psf.kind = "measured")')
+            + ", or leave the brightest out if their images differ, as a detector may make them",
+        )  # fmt: skip
+        return Finding(cause, explained, "PSF", RICHER)
     cause = Cause(
-        "wrong sources", 0.0,
-        f"{failed.size} of {len(s)} sources do not fit: rows of the catalogue, from 0: "
-        f"{names}{more}",
+        "wrong sources", 0.0, f"{failed.size} of {len(s)} sources do not fit: {rows}",
         "correct their positions and fluxes, or leave them out",
     )  # fmt: skip
     return Finding(cause, explained, "wrong sources", RICHER)
