@@ -20,6 +20,7 @@ FEW = 0.2  # of the sources: more than these are not the ones to blame
 OUTLYING = 6.0  # times the typical misfit of a source as bright
 NOTICEABLE = 6.0  # standard deviations
 NAMED = 5  # sources listed
+RICHEST = 0.7  # weight of companions, which near enough are displacements, too, and other PSFs
 REJECT = "set frame.reject_outliers = true"
 ORDERS = range(5)  # of the pattern that is no companion, coma and trefoil included
 
@@ -169,4 +170,4 @@ def companions(context: Context) -> Finding | None:
         "complete the catalogue" if context.rejected
         else f"{REJECT}, which leaves out the sources concerned, or complete the catalogue",
     )  # fmt: skip
-    return Finding(cause, float(best[some].sum()), "light position", RICHER)
+    return Finding(cause, float(best[some].sum()), "light position", RICHEST)
