@@ -127,6 +127,22 @@ def two_amplifiers(seed: int) -> Posterior:
     return replace(posterior, counts=posterior.counts + more)
 
 
+def dead_columns(seed: int) -> Posterior:
+    """Two columns are dead, and one records half."""
+    posterior = true(seed, flux="free")
+    frame = posterior.counts.copy()
+    frame[:, [40, 90]] = 0.0
+    frame[:, 120] = np.floor(0.5 * frame[:, 120])
+    return replace(posterior, counts=frame)
+
+
+def banding(seed: int) -> Posterior:
+    """The read-out adds a constant to every row, of 3 counts (rms)."""
+    posterior = true(seed)
+    more = np.random.default_rng(seed + 20_000).normal(0.0, 3.0, (SHAPE[0], 1))
+    return replace(posterior, counts=np.maximum(np.round(posterior.counts + more), 0.0))
+
+
 def narrow_psf_on_grid(seed: int) -> Posterior:
     """Sources, all in even rows and columns, are wider than 0.6 pixels."""
     model = camera(SourceCatalog.grid(15, 8.0, 2e4), psf=GaussianPSF(0.6))
@@ -323,6 +339,8 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "over-dispersion": (over_dispersion, ("over-dispersion",)),
     "colour filter": (colour_filter, ("alternating pixels",)),
     "two amplifiers": (two_amplifiers, ("alternating pixels",)),
+    "dead columns": (dead_columns, ("rows or columns",)),
+    "banding": (banding, ("rows or columns",)),
     "background": (background, ("background",)),
     "origin": (origin, ("origin",)),
     "parity": (parity, ("parity",)),

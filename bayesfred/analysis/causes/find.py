@@ -8,7 +8,7 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.light import companions, fluxes, psf, single_sources
-from bayesfred.analysis.causes.pixels import alternation, background_and_noise, saturation
+from bayesfred.analysis.causes.pixels import alternation, background_and_noise, lines, saturation
 from bayesfred.analysis.causes.positions import placement, scatter, unmatched
 from bayesfred.model.posterior import Posterior
 
@@ -57,10 +57,9 @@ def find_causes(
     if not context.light.matched.any() and abs(context.excess) < NOTICEABLE * context.spread:
         return (replace(unmatched(context).cause, share=1.0),)
     if context.light.matched.any():
-        alternating, corrected = alternation(context)
-        if alternating is not None:
-            findings.append(alternating)
-            context = replace(context, corrected=corrected)
+        for read_out in (alternation, lines):
+            found, context = read_out(context)
+            findings += found
     if context.light.matched.any() or context.bright.any():
         place = placement(context)
         findings += [place, *background_and_noise(context)]

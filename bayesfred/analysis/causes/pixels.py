@@ -1,7 +1,8 @@
-"""Hypotheses about pixels: saturation, colour filters, the noise's variance, the background."""
+"""Hypotheses about pixels: saturation, colour filters, the read-out's lines, noise, background."""
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -18,6 +19,11 @@ TILE = 16  # pixels a side of the squares in which the noise is measured
 FEWEST_QUIET = 24  # of a tile's pixels, or it does not count
 FEWEST_TILES = 5
 NOTICEABLE = 5.0  # standard deviations
+OUTLYING = 3.0  # standard deviations, as which a pixel of a line counts at most
+AROUND = 9  # lines, among which one is compared
+FEW_LINES = 0.05  # of the lines: more than these are all
+NAMED = 5  # lines listed
+LINES = "rows or columns"
 STEEPEST = (
     30.0  # times the background's, to which noise in proportion to the counts is extrapolated
 )
@@ -77,8 +83,8 @@ def saturation(context: Context) -> tuple[Finding | None, Flags]:
     return Finding(cause, explained, "saturation"), np.asarray(spoiled & context.posterior.mask)
 
 
-def alternation(context: Context) -> tuple[Finding | None, Floats]:
-    """Even and odd rows and columns that differ, and the counts that are expected if they do.
+def alternation(context: Context) -> tuple[list[Finding], Context]:
+    """Even and odd rows and columns that differ, and what is left if they are expected to.
 
     Pixels of a colour camera, behind filters, record other shares of the light; where rows or
     columns are read by amplifiers of their own, other constants are added.
@@ -98,8 +104,8 @@ def alternation(context: Context) -> tuple[Finding | None, Floats]:
         # of sources on a regular grid a wrong PSF favours even pixels, too
         shared = common_pattern(context, (0, 2))
         if shared is not None and shared.explained > found.explained:
-            return None, context.expected
-    return found, best
+            found = None
+    return ([], context) if found is None else ([found], replace(context, corrected=best))
 
 
 def _alternating(size: Floats, of_light: bool) -> Cause:
@@ -112,6 +118,46 @@ def _alternating(size: Floats, of_light: bool) -> Cause:
         "take the pixels of one colour if the camera has a colour filter, or set frame.flat to "
         "the relative response of every pixel" if of_light else "subtract a dark frame first",
     )  # fmt: skip
+
+
+def lines(context: Context) -> tuple[list[Finding], Context]:
+    """Rows or columns unlike the others, and what is left without what is wrong with them.
+
+    Dead or hot ones are few; where the read-out adds a constant to each there are many. A constant
+    is the mean residual of a line's pixels between the sources, less that of the lines around it;
+    a cosmic ray hardly counts.
+    """
+    findings = []
+    for axis, name in enumerate(("columns", "rows")):
+        z, sd = np.clip(context.z, -OUTLYING, OUTLYING), np.sqrt(context.variance)
+        quiet = np.where(context.quiet, 1.0 / sd**2, 0.0).sum(axis=axis)
+        pull = np.where(context.quiet, z / sd, 0.0).sum(axis=axis)
+        known = quiet > 0.0
+        size = np.where(known, pull / np.where(known, quiet, 1.0), 0.0)
+        size -= ndimage.median_filter(size, AROUND)
+        odd = np.abs(size) * np.sqrt(quiet) > NOTICEABLE
+        if 0 < odd.sum() <= FEW_LINES * size.size:
+            here = odd[None] if axis == 0 else odd[:, None]
+            held = float(np.sum(np.where(here, context.z**2 - context.used, 0.0)))
+            left = replace(context, left_out=context.left_out | here)
+            which = ", ".join(map(str, np.flatnonzero(odd)[:NAMED]))
+            more = ", ..." if odd.sum() > NAMED else ""
+            sentence = f"{odd.sum()} {name} are unlike the others: {which}{more}, from 0"
+            remedy = "mask them: NaN in the frame"
+        else:
+            constant = np.broadcast_to(size if axis == 0 else size[:, None], context.z.shape)
+            z = (context.residual - constant) / sd
+            held = float(np.sum(np.where(context.used, context.z**2 - z**2, 0.0))) - size.size
+            left = replace(context, corrected=context.expected + constant)
+            sentence = (
+                f"all {name} have constants of their own, by {size.std():.2g} counts (root mean "
+                "square): the read-out adds them"
+            )
+            remedy = f"subtract from the {name} what their pixels between the sources tell of it"
+        if held > NOTICEABLE * (2.0 * size.size) ** 0.5:
+            findings.append(Finding(Cause(LINES, 0.0, sentence, remedy), held, name))
+            context = left
+    return findings, context
 
 
 def background_and_noise(context: Context) -> Iterator[Finding]:
