@@ -22,6 +22,7 @@ from bayesfred.io.pixel_maps import read_mapped_frame
 from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import refuse_nodes
+from bayesfred.optimize.alternating import alternating_message
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, reject_outliers
 from bayesfred.optimize.follow import followed_images
@@ -132,7 +133,7 @@ def read_doubted(
         path, maps, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
     noise, line = build.noise_given(run, run_file, maps, frame.read_noise)
-    note(frame.description, line)
+    note(frame.description, line, alternating_message(frame.counts, frame.valid))
     shape = (frame.counts.shape[0], frame.counts.shape[1])
     psf = psf or _reference_psf(run, run_file)
     psf, frame, lines = _by_its_peaks(run, psf, frame, noise)
