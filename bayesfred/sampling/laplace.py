@@ -7,10 +7,9 @@ Around its maximum m the log-posterior is, to second order,
 I the Fisher information plus the curvature of the prior. So the posterior is approximated by the
 normal distribution of mean m and covariance I^-1. Here independent draws are made from it, so that
 everything that is read off a chain can be read off these draws too. A prior that ends near m cuts
-the distribution there, see `LaplaceMove`, which also nests it on a hyperparameter, corrects it for
-the model error's, and mixes those of several modes. The posterior itself is not evaluated at the
-draws: that would cost as much as sampling it. `importance_efficiency` does so at some of them, to
-see how good the approximation is.
+the distribution there, see `LaplaceMove`; what else is corrected for, such as a hyperparameter, is
+in `approximations`. The posterior itself is not evaluated at the draws: that would cost as much as
+sampling it. `importance_efficiency` does so at some of them, to see how good the approximation is.
 
 References
 ----------
