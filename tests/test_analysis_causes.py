@@ -299,3 +299,14 @@ def test_read_noise_counts_as_variance(read_noise: Any) -> None:
     light = (mu - 0.05) ** 2 / (mu + variance)
     assert context.power.sum() == pytest.approx(light.sum(), rel=0.02)
     assert np.isfinite(context.catalogue_power).all()
+
+
+def test_a_cause_leaves_some_counts_expected() -> None:
+    """A constant that is larger than all counts of a line: their variance would be none."""
+    posterior = planted.true(1)
+    context = Context(posterior, np.append(planted.THETA, planted.LEVEL), ~posterior.mask)
+    assert np.allclose(
+        context.corrected_by(np.full(planted.SHAPE, 7.0)).residual, -7.0 + context.residual
+    )
+    less = context.corrected_by(np.full(planted.SHAPE, -1e6))
+    assert np.allclose(less.expected, 0.1 * context.expected) and less.variance.min() > 1.0

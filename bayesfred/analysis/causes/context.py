@@ -1,6 +1,6 @@
 """What all hypotheses look at: residuals, and which pixels belong to which source."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ CORE = 3.0  # PSF widths around an image that are called the source's pixels
 QUIET = 5.0  # PSF widths from every image and detection at which pixels hold background alone
 DETECTED = 5.0  # standard deviations of a detection
 NEARBY = 0.1  # share of the light around it that a detection exceeds, or it is a wing
+LEAST = 0.1  # of expected counts, to which an earlier cause may lower them
 BRIGHT = 64.0  # squared signal to noise of a source that has to be seen
 
 
@@ -72,6 +73,11 @@ class Context:
     def noise(self) -> Noise:
         """That of the counts, with the model error."""
         return self.posterior.noise_at(self.params)
+
+    def corrected_by(self, change: Floats) -> "Context":
+        """What is left if so many more counts are expected; a tenth of what were, at the least."""
+        least = np.where(self.expected > 0.0, LEAST * self.expected, -np.inf)
+        return replace(self, corrected=np.maximum(self.expected + change, least))
 
     @property
     def level(self) -> float:

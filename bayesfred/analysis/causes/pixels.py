@@ -91,7 +91,7 @@ def alternation(context: Context) -> tuple[list[Finding], Context]:
     """
     ny, nx = context.expected.shape
     kind = np.arange(ny)[:, None] % 2 * 2 + np.arange(nx) % 2
-    found, best = None, context.expected
+    found, change = None, context.expected
     for of_light, unit in ((True, context.expected), (False, np.ones(kind.shape))):
         t = np.where(context.used, unit / np.sqrt(context.variance), 0.0)
         pull, power = (np.bincount(kind.ravel(), (t * each).ravel(), 4) for each in (context.z, t))
@@ -99,13 +99,13 @@ def alternation(context: Context) -> tuple[list[Finding], Context]:
         explained = float(pull @ size - pull.sum() ** 2 / max(power.sum(), 1e-300)) - 3.0
         if explained > max(NOTICEABLE * 6.0**0.5, found.explained if found else 0.0):
             found = Finding(_alternating(size, of_light), explained, "alternation")
-            best = context.expected + size[kind] * unit
+            change = size[kind] * unit
     if found is not None:
         # of sources on a regular grid a wrong PSF favours even pixels, too
         shared = common_pattern(context, (0, 2))
         if shared is not None and shared.explained > found.explained:
             found = None
-    return ([], context) if found is None else ([found], replace(context, corrected=best))
+    return ([], context) if found is None else ([found], context.corrected_by(change))
 
 
 def _alternating(size: Floats, of_light: bool) -> Cause:
@@ -148,7 +148,7 @@ def lines(context: Context) -> tuple[list[Finding], Context]:
             constant = np.broadcast_to(size if axis == 0 else size[:, None], context.z.shape)
             z = (context.residual - constant) / sd
             held = float(np.sum(np.where(context.used, context.z**2 - z**2, 0.0))) - size.size
-            left = replace(context, corrected=context.expected + constant)
+            left = context.corrected_by(constant)
             sentence = (
                 f"all {name} have constants of their own, by {size.std():.2g} counts (root mean "
                 "square): the read-out adds them"
