@@ -9,6 +9,7 @@ import numpy as np
 from bayesfred._typing import Flags, Floats
 
 APART = 0.25  # share of the squares by which more of them have one kind of pixel above the others
+MOST = 2048  # pixels along each axis, about the middle, that are looked at
 FEWEST = 1000  # squares of 2 x 2 pixels, of which that share is known to 0.016
 
 
@@ -37,8 +38,10 @@ def alternating_message(counts: Floats, valid: Flags) -> str:
     >>> alternating_message(counts, counts >= 0.0)[:37]
     'even and odd rows and columns differ:'
     """
-    ny, nx = (n // 2 * 2 for n in counts.shape)
-    squares = np.where(valid, counts, np.nan)[:ny, :nx].reshape(ny // 2, 2, nx // 2, 2)
+    ny, nx = (min(n, MOST) // 2 * 2 for n in counts.shape)
+    j, i = ((n - m) // 4 * 2 for n, m in zip(counts.shape, (ny, nx), strict=True))
+    middle = slice(j, j + ny), slice(i, i + nx)
+    squares = np.where(valid[middle], counts[middle], np.nan).reshape(ny // 2, 2, nx // 2, 2)
     kinds = squares.transpose(1, 3, 0, 2).reshape(4, -1)
     kinds = kinds[:, np.isfinite(kinds).all(axis=0)]
     if kinds.shape[1] < FEWEST:
