@@ -15,7 +15,7 @@ from bayesfred.imaging.kernels.splines import (
     spline_second_derivatives,
     spline_slopes,
 )
-from bayesfred.imaging.psf.sampled import spline_profile
+from bayesfred.imaging.psf.sampled import new_spline_places, spline_profile
 
 ROWS, COLUMNS = 9, 12  # not square, so that the two axes cannot be mistaken for each other
 
@@ -95,3 +95,20 @@ def test_rows_of_pixels_are_scipys(stride: int, drift: float) -> None:
         )
         turned = np.einsum("pj,ij,pi->p", by_y, c, by_x)
         assert np.abs(found - turned).max() > 0.1  # the axes the other way round
+
+
+@nb.njit
+def places_where_denormal_numbers_were(width: Any) -> Any:
+    for _ in range(8):
+        size = width + 8
+        left = [np.full(size, 5e-324) for _ in range(4)]
+        left.clear()
+    _, y, x, _ = new_spline_places(width)
+    return y, x
+
+
+def test_what_memory_held_is_not_calculated_with() -> None:
+    """The last pixels of a row take others along, and arithmetic with denormal numbers is slow."""
+    for width in (64, 528, 4112):
+        y, x = places_where_denormal_numbers_were(width)
+        assert not y.any() and not x.any()

@@ -19,7 +19,7 @@ from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
-from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, exp2, log, take_turn
+from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, exp2, log, take_turn, wide_vectors
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
 from bayesfred.model.parameters import Nuisances
@@ -277,6 +277,21 @@ def test_exp2_is_as_exact_as_it_says() -> None:
     )
     exact = np.exp2(x.astype(np.longdouble))
     assert np.abs(vectorised(exp2, FAST)(x) / exact - 1).max() < 1.5e-14
+
+
+def test_only_functions_that_ask_for_them_have_wide_vectors() -> None:
+    @nb.njit
+    def wide(x: Any) -> Any:
+        wide_vectors()
+        return 2.0 * x
+
+    @nb.njit
+    def plain(x: Any) -> Any:
+        return 2.0 * x
+
+    assert wide(3.0) == plain(3.0) == 6.0
+    texts = [next(iter(f.inspect_llvm().values())) for f in (wide, plain)]
+    assert ['"prefer-vector-width"="512"' in text for text in texts] == [True, False]
 
 
 def test_threads_that_take_turns_miss_and_repeat_none() -> None:

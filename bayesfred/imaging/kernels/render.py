@@ -6,7 +6,7 @@ two Horner sweeps and one exponential.
 
 from bayesfred.imaging.kernels.compilation import entry, shared
 from bayesfred.imaging.kernels.contexts import Canvas
-from bayesfred.imaging.kernels.fastmath import FAST
+from bayesfred.imaging.kernels.fastmath import FAST, wide_vectors
 from bayesfred.imaging.kernels.geometry import (
     lay_out,
     locate,
@@ -39,6 +39,7 @@ def _add_samples(layout, s, rows, flux, canvas, alone):
     # What the rows share is taken out of the tuples once, and the loop over pixels stays in this
     # function: a call costs more than a short row. It counts no references: threads count those to
     # what they share in turn.
+    wide_vectors()
     o, fp, sigma, work = layout.optics, layout.footprints, layout.sigma, layout.work
     source, places = one_source(layout.geometry, s), layout.places
     psf = psf_of_source(o.psf, source.number)

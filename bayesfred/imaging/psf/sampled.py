@@ -35,8 +35,10 @@ MARGIN = 4  # zeros around a spline's coefficients
 @inner()
 def new_spline_places(width):
     """Cells, what is passed of them along y and x, and values, see `SplineProfile.find_places`."""
-    size = width + LANES  # the last pixels are made together with what lies behind them
-    return np.empty(size, np.int64), np.empty(size), np.empty(size), np.empty(size)
+    # The last pixels are made together with what lies behind them. It is zero at first: what memory
+    # holds may be denormal numbers, with which arithmetic takes a hundred times as long.
+    size = width + LANES
+    return np.empty(size, np.int64), np.zeros(size), np.zeros(size), np.empty(size)
 
 
 class SplineProfile(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import LANES, SEGMENT, Optics, SourceNuisances
-from bayesfred.imaging.kernels.fastmath import FAST
+from bayesfred.imaging.kernels.fastmath import FAST, wide_vectors
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
 from bayesfred.model.kernels.contexts import LIMIT, STRETCH, Unreached, Workspace
 from bayesfred.model.kernels.noise_dispatch import derivatives, given, summed, unreached
@@ -317,6 +317,7 @@ def log_likelihood(frame, w, parameters):
 @leaf()
 def _sum_marked(frame, noise, w, background):
     """Sum of the log-densities of the marked pixels."""
+    wide_vectors()
     pitch, total = frame.values.size // frame.ny, 0.0
     for j in range(frame.ny):
         start, stop = next_run(w, j, w.span[j, 0])

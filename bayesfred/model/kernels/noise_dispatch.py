@@ -53,7 +53,7 @@ from numba.extending import overload
 
 from bayesfred.imaging.kernels.compilation import leaf
 from bayesfred.imaging.kernels.contexts import SEGMENT
-from bayesfred.imaging.kernels.fastmath import REDUCE
+from bayesfred.imaging.kernels.fastmath import REDUCE, wide_vectors
 from bayesfred.imaging.kernels.psf_dispatch import by_type
 from bayesfred.model.kernels.contexts import LIMIT, STRETCH
 from bayesfred.model.kernels.mean_series import BLOCK, sum_polynomials
@@ -114,6 +114,7 @@ def _choose_part(mean: Any, first: Any, size: Any) -> Any:
 @leaf(fastmath=REDUCE)
 def sum_pixels(noise, values, light, mean, first):
     """Sum of the log-densities of the unmasked pixels of a stretch, one by one."""
+    wide_vectors()
     (image, level, response), total = mean, 0.0
     for i in range(image.size):
         mu = scaled(image[i] + level, response, i)
