@@ -1,10 +1,9 @@
-"""Clusters of touching footprints, and the linear algebra of their matrices.
+"""Clusters of touching footprints, and what their matrices consist of.
 
 The matrix H of `fluxes.py` couples only sources whose footprints share pixels, so everything is
 done cluster by cluster.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from bayesfred.imaging.kernels.compilation import inner, leaf, shared
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.model.kernels.contexts import Clusters, Group
+from bayesfred.model.kernels.factors import inner_product
 
 DOF = 3.0  # of Student's distribution of the shifts
 SHARE = DOF / (DOF + 2.0)  # of k in H, see `fluxes.py`
@@ -263,92 +263,6 @@ def add_block(i, start, out, block):
     out[row[2] + column + 2] += block[5]
 
 
-@leaf(fastmath=REDUCE)
-def _inner(a, b):
-    total = 0.0
-    for i in range(a.size):
-        total += a[i] * b[i]
-    return total
-
-
-@shared(_nrt=False)
-def cholesky(h, group):
-    """Lower triangle in place; False where the matrix is not positive definite."""
-    lead, start = group.lead, group.start
-    for i in range(lead.size):
-        at = start[i]
-        for k in range(lead[i], i + 1):
-            first = max(lead[i], lead[k])
-            total = h[at + k] - _inner(h[at + first : at + k], h[start[k] + first : start[k] + k])
-            if i > k:
-                h[at + k] = total / h[start[k] + k]
-            elif total > 0.0:
-                h[at + i] = math.sqrt(total)
-            else:
-                return False
-    return True
-
-
-@shared(_nrt=False)
-def solve(lower, group, x):
-    """x <- (L L^T)^-1 x, in place."""
-    lead, start = group.lead, group.start
-    for i in range(x.size):
-        at = start[i]
-        x[i] = (x[i] - _inner(lower[at + lead[i] : at + i], x[lead[i] : i])) / lower[at + i]
-    for i in range(x.size - 1, -1, -1):
-        at = start[i]
-        x[i] /= lower[at + i]
-        for m in range(lead[i], i):
-            x[m] -= lower[at + m] * x[i]
-
-
-@leaf(fastmath=REDUCE)
-def _times_row(row, factor, x, out):
-    """Add factor times a row to out, and return the row's product with x."""
-    total = 0.0
-    for i in range(row.size):
-        total += row[i] * x[i]
-        out[i] += factor * row[i]
-    return total
-
-
-@shared()
-def invert(lower, group):
-    """(L L^T)^-1 where L has elements, stored as L is; those elsewhere are not needed for these.
-
-    References
-    ----------
-    K. Takahashi, J. Fagan & M.-S. Chin, 8th PICA Conference (1973): Q L is the upper triangle
-    L^-T, whose diagonal is known, and tells the columns of Q from the last to the first.
-    """
-    lead, start, size = group.lead, group.start, group.lead.size
-    out, ends = np.empty(lower.size), np.zeros(size, np.int64)
-    for i in range(size):
-        ends[lead[i]] = i + 1  # of a column, where only earlier ones end later, too
-    column, found = np.zeros(size), np.zeros(size)
-    for j in range(1, size):
-        ends[j] = max(ends[j], ends[j - 1])
-    for j in range(size - 1, -1, -1):
-        found[j + 1 : ends[j]] = 0.0
-        for i in range(j + 1, ends[j]):
-            column[i] = lower[start[i] + j] if lead[i] <= j else 0.0
-        for i in range(j + 1, ends[j]):
-            if lead[i] <= j:
-                at, within = start[i], slice(j + 1, i)
-                row = out[at + j + 1 : at + i]
-                own = _times_row(row, column[i], column[within], found[within])
-                found[i] += own + out[at + i] * column[i]
-        pivot = 1.0 / lower[start[j] + j]
-        own = pivot
-        for i in range(j + 1, ends[j]):
-            if lead[i] <= j:
-                out[start[i] + j] = -found[i] * pivot
-                own += found[i] * pivot * column[i]
-        out[start[j] + j] = own * pivot
-    return out
-
-
 @leaf()
 def add_template(fp, rows, template, amplitude, canvas):
     """Add amplitude times rows of one of a source's templates, shape (samples,), to a canvas."""
@@ -370,6 +284,6 @@ def project(fp, s, template, image, at):
     while i < fp.first[s + 1]:
         end = run_end(fp, i, fp.first[s + 1], at)
         stamp = template[fp.start[i] : fp.start[end]]
-        total += _inner(stamp, image[at[i] : at[i] + stamp.size])
+        total += inner_product(stamp, image[at[i] : at[i] + stamp.size])
         i = end
     return total

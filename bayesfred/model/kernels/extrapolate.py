@@ -26,9 +26,10 @@ from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import layout_of, locate, new_geometry, row_starts
 from bayesfred.imaging.kernels.render import add_source
-from bayesfred.model.kernels.clusters import bounding_boxes, cholesky, one_cluster, solve
+from bayesfred.model.kernels.clusters import bounding_boxes, one_cluster
 from bayesfred.model.kernels.contexts import Clusters
 from bayesfred.model.kernels.expansion import OVERLAP, own_run, pair, shared_run, single
+from bayesfred.model.kernels.factors import cholesky, solve
 from bayesfred.model.kernels.likelihood import (
     U,
     counted,

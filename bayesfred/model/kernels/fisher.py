@@ -14,15 +14,13 @@ from bayesfred.model.kernels.clusters import (
     DOF,
     Prior,
     add_prior,
-    cholesky,
     dot,
     gram,
-    invert,
     one_cluster,
     shift_prior,
-    solve,
 )
 from bayesfred.model.kernels.contexts import LIMIT
+from bayesfred.model.kernels.factors import cholesky, invert, solve
 from bayesfred.model.kernels.likelihood import (
     U,
     background_row,

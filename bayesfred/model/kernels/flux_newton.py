@@ -26,14 +26,9 @@ from bayesfred.imaging.kernels.compilation import inner, leaf
 from bayesfred.imaging.kernels.contexts import Canvas, Layout
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.render import add_source, add_templates
-from bayesfred.model.kernels.clusters import (
-    Prior,
-    cholesky,
-    shared_rows,
-    solve,
-    touch,
-)
+from bayesfred.model.kernels.clusters import Prior, shared_rows, touch
 from bayesfred.model.kernels.contexts import Group, Touching
+from bayesfred.model.kernels.factors import cholesky, solve
 from bayesfred.model.kernels.likelihood import U
 from bayesfred.model.kernels.noise_dispatch import given
 from bayesfred.model.kernels.patches import Patch, weigh_patch

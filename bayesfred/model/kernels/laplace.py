@@ -20,16 +20,14 @@ from bayesfred.model.kernels.clusters import (
     add_prior,
     add_template,
     bend_prior,
-    cholesky,
     gram,
-    invert,
     one_cluster,
     shift_prior,
-    solve,
     touch,
 )
 from bayesfred.model.kernels.contexts import Nearby, Touching
 from bayesfred.model.kernels.expansion import Pixels, add_slopes, expand
+from bayesfred.model.kernels.factors import cholesky, invert, solve
 from bayesfred.model.kernels.likelihood import blank
 
 

@@ -26,13 +26,12 @@ from bayesfred.model.kernels.clusters import (
     add_prior,
     add_template,
     bend_prior,
-    cholesky,
     copy,
     gram,
     project,
     shift_prior,
-    solve,
 )
+from bayesfred.model.kernels.factors import cholesky, solve
 from bayesfred.model.kernels.flux_newton import make_templates
 from bayesfred.model.kernels.likelihood import slope_run, stretch
 from bayesfred.model.kernels.noise_dispatch import exact_weight, given, sum_pixels
