@@ -24,8 +24,9 @@ from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
 from bayesfred.optimize.newton import maximize
+from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain
-from bayesfred.sampling.laplace import importance_efficiency, laplace
+from bayesfred.sampling.laplace import MIN_EFFICIENCY, importance_efficiency, laplace
 from bayesfred.sampling.sampler import sample
 
 Floats = NDArray[np.float64]
@@ -166,6 +167,46 @@ def test_importance_efficiency_is_that_of_the_two_densities() -> None:
         ]
         assert np.mean(found) == pytest.approx(s * np.sqrt(2 - s**2), abs=0.03)
         assert np.min(found) >= least
+
+
+def drawn_with(efficiency: float, seed: int, evaluated: list[int]) -> Chain:
+    """Draws from N(0, 1) of which this share is effective; counts what is evaluated from now on."""
+
+    class Counted(Normal):
+        def log_prob(self, params: npt.ArrayLike) -> Any:
+            evaluated.append(len(np.atleast_2d(params)))
+            return super().log_prob(params)
+
+    each = 1.0 - np.sqrt(1.0 - efficiency ** (2.0 / 3.0))  # variance of three parameters
+    estimate = MapEstimate(np.zeros(3), np.eye(3), 0.0, 1, "found")
+    chain = laplace(Counted(each * np.eye(3)), estimate, seed=seed, progress=False)
+    evaluated.clear()
+    return chain
+
+
+@pytest.mark.parametrize(("efficiency", "fewest", "most"), [(0.98, 64, 64), (0.2, 16, 18)])
+def test_importance_efficiency_takes_few_draws_where_these_tell(
+    efficiency: float, fewest: float, most: float
+) -> None:
+    evaluated: list[int] = []
+    numbers = []
+    for seed in range(50):
+        importance_efficiency(drawn_with(efficiency, seed, evaluated))
+        numbers.append(sum(evaluated))
+    assert fewest <= np.mean(numbers) <= most
+
+
+def test_importance_efficiency_near_its_bound_is_rarely_on_the_wrong_side() -> None:
+    """On the right one in 97.5 % of 200 chains, known to 1.1 %; from 64 draws in 82 +- 3 %."""
+    right, control = 0, 0
+    for seed in range(200):
+        chain = drawn_with(0.77, seed, [])
+        right += importance_efficiency(chain) < MIN_EFFICIENCY
+        x = chain.chain.reshape(-1, 3)
+        w = np.exp(chain.density.log_prob(x) - chain.log_prob.ravel())[::16]
+        control += w.sum() ** 2 / np.sum(w**2) / w.size < MIN_EFFICIENCY
+    assert right > 186
+    assert control < 180
 
 
 def test_importance_efficiency_without_density_is_zero() -> None:

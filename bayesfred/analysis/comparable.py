@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayesfred.analysis.joint_folds import AnyPosterior, FrameView, frame_views
-from bayesfred.analysis.verdict import MIN_EFFICIENCY, judge_approximation, judge_sampling
+from bayesfred.analysis.verdict import judge_approximation, judge_sampling
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.displacement import frame_posterior
-from bayesfred.sampling.laplace import importance_efficiency
+from bayesfred.sampling.laplace import MIN_EFFICIENCY, importance_efficiency
 
 __all__ = ["comparable_posteriors", "require_sampled"]
 

@@ -32,7 +32,6 @@ from bayesfred.analysis.residuals import Residuals, judge_residuals, predictive_
 from bayesfred.analysis.robust import robust_sd
 from bayesfred.analysis.sensitivity import sensitivities
 from bayesfred.analysis.verdict import (
-    MIN_EFFICIENCY,
     judge_approximation,
     judge_fit,
     judge_sampling,
@@ -45,7 +44,7 @@ from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
-from bayesfred.sampling.laplace import importance_efficiency
+from bayesfred.sampling.laplace import MIN_EFFICIENCY, importance_efficiency
 from bayesfred.sampling.sampler import check_density
 from bayesfred.sampling.summary import summary
 

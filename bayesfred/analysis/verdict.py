@@ -19,9 +19,9 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.sampling.chain import Chain
+from bayesfred.sampling.laplace import MIN_EFFICIENCY
 
 __all__ = [
-    "MIN_EFFICIENCY",
     "FitVerdict",
     "judge_approximation",
     "judge_fit",
@@ -31,7 +31,6 @@ __all__ = [
 
 MAX_RHAT = 1.01
 MIN_ACCEPTANCE = 0.1
-MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
 LEAST_MODE = 0.01  # share of the draws from which a mode is told of
 HARDLY = 0.1  # share of its weight below which a source far off its position is named
 MOST_NAMED = 10

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesfred._typing import PathLike
+from bayesfred._typing import Floats, PathLike
 from bayesfred.errors import InputError
 from bayesfred.io.lock import only_writer
 from bayesfred.io.paths import may_write
@@ -37,10 +37,14 @@ from bayesfred.sampling.progress import working
 from bayesfred.sampling.record import RunRecord
 from bayesfred.sampling.sampler import check_estimate, check_output, versions
 
-__all__ = ["importance_efficiency", "laplace"]
+__all__ = ["MIN_EFFICIENCY", "importance_efficiency", "laplace"]
 
 DRAWS = 1000
-WEIGHTED = 64  # draws at which the posterior is evaluated: seconds, where all would be minutes
+MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation then
+# Numbers of draws at which the posterior is evaluated, one after the other until they tell on which
+# side of the bound the efficiency is, by two standard deviations: of all it would take minutes.
+WEIGHTED = 16, 64, 256
+ENOUGH = 64  # below which large weights may have been missed
 
 
 def laplace(
@@ -164,7 +168,8 @@ def importance_efficiency(chain: Chain) -> float:
     Returns
     -------
     float
-        From 0 to 1, from 64 evenly spaced draws; 1 where the posterior is normal.
+        From 0 to 1; 1 where the posterior is normal. It is from 16 to 256 evenly spaced draws, as
+        many as tell whether it is below `MIN_EFFICIENCY`.
 
     References
     ----------
@@ -182,10 +187,28 @@ def importance_efficiency(chain: Chain) -> float:
     """
     chain = chain.whole or chain
     draws, log_q = chain.chain.reshape(-1, len(chain.parameter_names)), chain.log_prob.ravel()
-    chosen = np.linspace(0, len(draws) - 1, min(WEIGHTED, len(draws))).astype(int)
-    log_weights = chain.density.log_prob(draws[chosen]) - log_q[chosen]
+    chosen = np.linspace(0, len(draws) - 1, min(WEIGHTED[-1], len(draws))).astype(int)
+    log_weights, known = np.empty(len(chosen)), np.zeros(len(chosen), dtype=bool)
+    for number in WEIGHTED:
+        due = np.zeros_like(known)
+        due[:: max(len(chosen) // number, 1)] = True
+        due &= ~known
+        log_weights[due] = chain.density.log_prob(draws[chosen[due]]) - log_q[chosen[due]]
+        known |= due
+        efficiency, sd = _efficiency(log_weights[known])
+        above = efficiency - MIN_EFFICIENCY
+        if above < -2.0 * sd or (number >= ENOUGH and above > 2.0 * sd):
+            break
+    return efficiency
+
+
+def _efficiency(log_weights: Floats) -> tuple[float, float]:
+    """The efficiency that weights tell, and its standard deviation to first order in theirs."""
     log_weights = np.where(log_weights < np.inf, log_weights, -np.inf)
     if not np.any(log_weights > -np.inf):
-        return 0.0
+        return 0.0, 0.0
     weights = np.exp(log_weights - log_weights.max())
-    return float(weights.sum() ** 2 / np.sum(weights**2) / weights.size)
+    weights /= weights.mean()
+    square = np.mean(weights**2)
+    spread = np.std(weights**2 - 2.0 * square * weights) / np.sqrt(weights.size)
+    return float(1.0 / square), float(spread / square**2)
