@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import bayesfred as bf
+from bayesfred.imaging.psf import PSF
 from bayesfred.sampling import sampler
 
 THETA = np.array([0.0, 2e-6, 0.0, -2e-6, 1e-6, 2e-6, 0.0, 3e-6, 0.0, 1e-6, 1e-6, -1e-6])
@@ -126,7 +127,7 @@ def growth(
         grown = bf.ForwardModel(camera, sources, m.psf, m.distortion)
         return lambda: grown.expected_counts(np.zeros(12))
 
-    def stars(psf: bf.PSF, pixel: str = "impulse") -> Callable[[], object]:
+    def stars(psf: PSF, pixel: str = "impulse") -> Callable[[], object]:
         camera = bf.Detector((512, 512), pixel=pixel)
         field = bf.ForwardModel(camera, bf.SourceCatalog.grid(20, 25.0, 1e5), psf, m.distortion)
         return lambda: field.expected_counts(THETA)

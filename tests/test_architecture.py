@@ -124,6 +124,21 @@ def test_examples_find_what_they_import(script: Path, monkeypatch: pytest.Monkey
     runpy.run_path(str(script), run_name="imported")
 
 
+def absent(source: str) -> set[str]:
+    """Names that a text takes of the package as `bf`, and that it does not have."""
+    return set(re.findall(r"\bbf\.([A-Za-z]\w*)", source)) - set(bayesfred.__all__)
+
+
+def test_benchmarks_and_examples_take_names_that_there_are() -> None:
+    scripts = [
+        path for folder in ("benchmarks", "examples") for path in ROOT.glob(f"{folder}/*.py")
+    ]
+    assert len(scripts) > 15
+    used = {path.name: absent(path.read_text(encoding="utf-8")) for path in scripts}
+    assert {name: names for name, names in used.items() if names} == {}
+    assert absent("def image(psf: bf.PSF) -> bf.Chain: ...") == {"PSF"}
+
+
 # --- places of one machine ------------------------------------------------------------------------
 
 MACHINE_PATH = re.compile(r"(?<![\w.<])/(?:work|tmp|home|root|Users|mnt)\b|\.\./shared|\b[A-Z]:\\")
