@@ -73,6 +73,7 @@ def wide_vectors(typingctx: Any) -> Any:
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        # a set's own `add`: that of llvmlite's refuses attributes that are of one target
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         return context.get_dummy_value()
 
