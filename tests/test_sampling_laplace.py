@@ -196,6 +196,14 @@ def test_importance_efficiency_takes_few_draws_where_these_tell(
     assert fewest <= np.mean(numbers) <= most
 
 
+def test_importance_efficiency_of_few_draws_evaluates_each_once() -> None:
+    evaluated: list[int] = []
+    chain = drawn_with(0.9, 0, evaluated)
+    few = replace(chain, chain=chain.chain[..., :40, :, :], log_prob=chain.log_prob[..., :40, :])
+    assert 0.0 < importance_efficiency(few) <= 1.0
+    assert 16 <= sum(evaluated) <= 40 and 0 not in evaluated
+
+
 def test_importance_efficiency_near_its_bound_is_rarely_on_the_wrong_side() -> None:
     """On the right one in 97.5 % of 200 chains, known to 1.1 %; from 64 draws in 82 +- 3 %."""
     right, control = 0, 0

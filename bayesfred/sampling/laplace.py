@@ -44,7 +44,6 @@ MIN_EFFICIENCY = 0.8  # any posterior mean is within half a standard deviation t
 # Numbers of draws at which the posterior is evaluated, one after the other until they tell on which
 # side of the bound the efficiency is, by two standard deviations: of all it would take minutes.
 WEIGHTED = 16, 64, 256
-ENOUGH = 64  # below which large weights may have been missed
 
 
 def laplace(
@@ -168,8 +167,8 @@ def importance_efficiency(chain: Chain) -> float:
     Returns
     -------
     float
-        From 0 to 1; 1 where the posterior is normal. It is from 16 to 256 evenly spaced draws, as
-        many as tell whether it is below `MIN_EFFICIENCY`.
+        From 0 to 1; 1 where the posterior is normal. It is from 16 to 256 of the draws, as many
+        as tell whether it is below `MIN_EFFICIENCY`.
 
     References
     ----------
@@ -187,17 +186,16 @@ def importance_efficiency(chain: Chain) -> float:
     """
     chain = chain.whole or chain
     draws, log_q = chain.chain.reshape(-1, len(chain.parameter_names)), chain.log_prob.ravel()
-    chosen = np.linspace(0, len(draws) - 1, min(WEIGHTED[-1], len(draws))).astype(int)
-    log_weights, known = np.empty(len(chosen)), np.zeros(len(chosen), dtype=bool)
-    for number in WEIGHTED:
-        due = np.zeros_like(known)
-        due[:: max(len(chosen) // number, 1)] = True
-        due &= ~known
-        log_weights[due] = chain.density.log_prob(draws[chosen[due]]) - log_q[chosen[due]]
-        known |= due
-        efficiency, sd = _efficiency(log_weights[known])
+    log_weights = np.empty(0)
+    for number in WEIGHTED:  # the draws are independent, so the first ones are as good as any
+        more = slice(log_weights.size, number)
+        log_p = chain.density.log_prob(draws[more])
+        log_weights = np.append(log_weights, log_p - log_q[more])
+        efficiency, sd = _efficiency(log_weights)
         above = efficiency - MIN_EFFICIENCY
-        if above < -2.0 * sd or (number >= ENOUGH and above > 2.0 * sd):
+        # a few draws may have missed large weights
+        is_known = above < -2.0 * sd or (above > 2.0 * sd and number > WEIGHTED[0])
+        if is_known or log_weights.size == len(draws):
             break
     return efficiency
 
