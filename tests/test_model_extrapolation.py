@@ -20,6 +20,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import MoffatPSF
 from bayesfred.model.extrapolation import Extrapolation, FluxExtrapolation, ShiftExtrapolation
 from bayesfred.model.kernels.extrapolate import ENOUGH
+from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.noise import PoissonNoise
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
@@ -266,3 +267,27 @@ def test_an_extrapolation_is_of_one_model() -> None:
     _, near, _ = solved("touching")
     with pytest.raises(InputError, match="extrapolation: got that of another model, expected"):
         replace(near, model=replace(near.model, tolerance=1e-9))
+
+
+def test_where_there_is_no_density_the_other_side_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without that of the first parameter, or with neither side, for which nothing changes."""
+    posterior, near, best = solved("touching")
+    search, reach = FrameLikelihood._found, 0.0
+
+    def found(likelihood: FrameLikelihood, vectors: Floats) -> Floats:
+        out = search(likelihood, vectors)
+        out[vectors[:, 0] - best.params[0] > reach] = np.nan
+        return out
+
+    def slope(posterior: Posterior) -> Floats:
+        known = posterior.likelihood.extrapolation
+        assert isinstance(known, FluxExtrapolation)
+        return known.slope / np.abs(known.slope).max(axis=0)
+
+    monkeypatch.setattr(FrameLikelihood, "_found", found)
+    other = slope(posterior.near(best.params, best.covariance))
+    assert other == pytest.approx(slope(near), abs=0.1)
+    assert not np.array_equal(other[:, 0], slope(near)[:, 0])
+    reach = -10.0
+    none = posterior.near(best.params, best.covariance).likelihood.extrapolation
+    assert isinstance(none, FluxExtrapolation) and not none.slope.any()

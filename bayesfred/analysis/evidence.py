@@ -17,9 +17,10 @@ The squared relative error of Z is the sum of those of the two means,
 
     Var_q(f1) / (n2 E_q[f1]^2) + Var_post(f2) / (n1 E_post[f2]^2),
 
-n1 now the effective number of draws for the mean of f2. q is centred on the maximum and does not
-depend on the draws. The chain has stored p at its draws, so the bridge costs one posterior for each
-draw of q.
+n1 now the effective number of draws for the mean of f2. One draw of q in 20 is from its share with
+tails, not left to chance; so Var_q is that within the shares. q is centred on the maximum and does
+not depend on the draws. The chain has stored p at its draws, so the bridge costs one posterior for
+each draw of q.
 
 References
 ----------
@@ -37,19 +38,22 @@ from arviz_stats.base import array_stats
 from scipy import optimize
 from scipy.special import expit, log_expit, logsumexp
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import effective_size
-from bayesfred.sampling.moves import LaplaceMove
+from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
 
 __all__ = ["Evidence", "importance_evidence", "log_evidence", "random_numbers"]
 
-PROPOSALS = 1000
-PARTS = 4  # of the draws, after which their error may be small enough
+PROPOSALS = 1000  # at most
+PRECISE = 0.01  # error of a chain's log-evidence with which fewer do
+PARTS = 10  # of these, after each of which it is compared
+PERIOD = round(1.0 / HEAVY_SHARE)  # draws of which one is from the proposal's share with tails
+MANY = 2  # draws for a parameter, above which it pays to know what is nearby
 COARSE = 0.3  # error above which a few draws decide
 EVEN = 5.0  # largest weight over their mean: the shape of such a tail is noise, and no matter
 STREAM = 20  # apart from the random numbers that made the chain
@@ -109,17 +113,53 @@ def log_evidence(chain: Chain) -> Evidence:
     >>> f"{found.log_evidence:.1f}", found.error < 0.05
     ('-10360.3', True)
     """
-    random, density = random_numbers(chain), chain.density
+    return with_ratios(chain)[0]
+
+
+def with_ratios(chain: Chain) -> tuple[Evidence, Floats]:
+    """The evidence as `log_evidence` finds it, and the ratios that it took.
+
+    Parameters
+    ----------
+    chain : Chain
+
+    Returns
+    -------
+    evidence : Evidence
+    ratios : ndarray, shape (n,)
+        Logarithms of posterior over proposal at draws of the proposal.
+    """
+    random, density, top = random_numbers(chain), chain.density, chain.estimate
     with one_blas_thread():
+        move, near = LaplaceMove.of(density, top), density.near(top.params, top.covariance)
         if chain.method == "laplace":
-            return importance_evidence(density, chain.estimate, PROPOSALS, random)[0]
-        move = LaplaceMove.of(density, chain.estimate)
+            ratios = _proposed(near, move, PROPOSALS, random)
+            return _mean(ratios), ratios
         kept = chain.log_prob[:, chain.burn_in :]
         draws = chain.chain[:, chain.burn_in :].reshape(-1, len(chain.parameter_names))
         log_q = move.log_density(draws).reshape(kept.shape)
         walkers = (kept - log_q).transpose(0, 2, 1).reshape(-1, kept.shape[1])
-        near = density.near(chain.estimate.params, chain.estimate.covariance)
-        return _bridge(walkers, _proposed(near, move, PROPOSALS, random))
+        ratios = np.empty(0)
+        for _ in range(PARTS):
+            ratios = np.append(ratios, _proposed(near, move, PROPOSALS // PARTS, random))
+            found = _bridge(walkers, ratios)
+            if found.error <= PRECISE:
+                break
+        return found, ratios
+
+
+def draws_needed(ratios: Floats, error: float, most: int) -> int:
+    """How many draws of the proposal give the evidence with an error, at most so many.
+
+    Parameters
+    ----------
+    ratios : ndarray, shape (n,)
+        Of other draws of such a proposal, see `with_ratios`.
+    error : float
+    most : int
+    """
+    needed = ratios.size * (_mean(ratios).error / error) ** 2
+    return min(PERIOD * math.ceil(needed / PERIOD), most)
 
 
 def importance_evidence(
@@ -127,7 +167,6 @@ def importance_evidence(
     top: MapEstimate,
     number: int,
     random: np.random.RandomState,
-    enough: float = 0.0,
 ) -> tuple[Evidence, float]:
     """The evidence by importance sampling from the proposal at a maximum.
 
@@ -137,10 +176,8 @@ def importance_evidence(
     top : MapEstimate
         Its maximum.
     number : int
-        Draws of the proposal.
+        Draws of the proposal: a multiple of 20.
     random : RandomState
-    enough : float
-        Error from which fewer do: after each quarter of them it is compared.
 
     Returns
     -------
@@ -159,21 +196,19 @@ def importance_evidence(
     ----------
     A. Vehtari et al. (2024), Journal of Machine Learning Research 25, 72: the shape and its limit.
     """
-    move, near = LaplaceMove.of(density, top), density.near(top.params, top.covariance)
-    ratios, error = np.empty(0), np.inf
-    while ratios.size < number and not error <= enough:
-        some = -(-number // PARTS) if enough else number
-        ratios = np.append(ratios, _proposed(near, move, some, random))
-        weights = np.exp(ratios - ratios.max())
-        error = float(np.std(weights, ddof=1) / np.mean(weights) / math.sqrt(ratios.size))
-    if error > COARSE:
+    move = LaplaceMove.of(density, top)
+    if number > MANY * top.params.size:
+        density = density.near(top.params, top.covariance)
+    ratios = _proposed(density, move, number, random)
+    found, weights = _mean(ratios), np.exp(ratios - ratios.max())
+    if found.error > COARSE:
         shape = np.inf
     elif weights.max() <= EVEN * weights.mean():
         shape = -np.inf
     else:
         with np.errstate(all="ignore"):  # of weights that are zero
             shape = float(array_stats.psislw(-ratios)[1])
-    return Evidence(float(logsumexp(ratios) - math.log(ratios.size)), error), shape
+    return found, shape
 
 
 def random_numbers(chain: Chain) -> np.random.RandomState:
@@ -182,18 +217,40 @@ def random_numbers(chain: Chain) -> np.random.RandomState:
 
 
 def _proposed(
-    density: TargetDensity,
-    move: LaplaceMove,
-    number: int,
-    random: np.random.RandomState,
+    density: TargetDensity, move: LaplaceMove, number: int, random: np.random.RandomState
 ) -> Floats:
     """Logarithms of posterior over proposal at draws of the proposal."""
-    draws = move.draw(number, random)
+    draws = move.draw(number, random, _heavy(number))
     values = density.log_prob(draws)
     values = np.where(values < np.inf, values, -np.inf)  # as the sampler takes them
     if not np.any(values > -np.inf):
         raise InputError(f"estimate: {OUTSIDE}: see find_map")
     return np.asarray(values - move.log_density(draws))
+
+
+def _mean(ratios: Floats) -> Evidence:
+    """The evidence by importance sampling."""
+    weights = np.exp(ratios - ratios.max())
+    error = math.sqrt(_variance(weights)) / float(weights.mean())
+    return Evidence(float(logsumexp(ratios) - math.log(ratios.size)), error)
+
+
+def _heavy(n: int) -> Flags:
+    """Which of n draws are from the share with tails: not left to chance, it has less error."""
+    return np.asarray(np.arange(n) % PERIOD == 0, dtype=np.bool_)
+
+
+def _variance(values: Floats) -> float:
+    """Of the mean over draws of the proposal, each share of which has its own.
+
+    Few draws are heavy. Their variance is told as if there were two more, of no weight and of that
+    which the others have: the draws that there are may have missed either.
+    """
+    heavy = _heavy(values.size)
+    light = values[~heavy]
+    known = np.append(values[heavy], [0.0, light.mean()])
+    every = np.where(heavy, np.var(known), np.var(light, ddof=1))
+    return float(every.mean()) / values.size
 
 
 def _bridge(walkers: Floats, proposed: Floats) -> Evidence:
@@ -214,6 +271,6 @@ def _bridge(walkers: Floats, proposed: Floats) -> Evidence:
     margin = 1.0 + math.log(n2)  # for proposals without posterior
     log_z = float(optimize.brentq(excess, finite.min() - margin, finite.max() + 1.0, xtol=1e-10))
     f1, f2 = expit(proposed - log_z + lead), expit(log_z - lead - walkers)
-    error = np.var(f1) / n2 / np.mean(f1) ** 2
+    error = _variance(f1) / np.mean(f1) ** 2
     error += np.var(f2) / max(effective_size(f2), 1.0) / np.mean(f2) ** 2
     return Evidence(log_z, math.sqrt(error))

@@ -77,12 +77,12 @@ def extrapolate(
     nearby: Nearby,
     around: tuple[Floats, Floats],
 ) -> Extrapolation | None:
-    """From fluxes and shifts at some parameters and a standard deviation to either side of them.
+    """From fluxes and shifts at some parameters and a standard deviation from them.
 
     That is along whitened axes. `around` are the parameters and a covariance. There is no
     extrapolation without one, or where the likelihood is zero. `found_at` gives fluxes and shifts
-    of n vectors, shape (n, s, 3), NaN where the map folds or the background ends; from there on
-    they are taken as constant.
+    of n vectors, shape (n, s, 3), NaN where the map folds or the background ends; there the other
+    side of the axis serves, and where that has none they are taken as constant.
     """
     (params, covariance), profiled, fluxes = around, rendered.profiled, rendered.fluxes
     axes = whitening(covariance)
@@ -90,10 +90,10 @@ def extrapolate(
         return None
     assert profiled is not None
     here = np.column_stack([fluxes, profiled.shifts])
-    sides = found_at(params + np.concatenate([axes.T, -axes.T])) - here
-    known = np.isfinite(sides[:, 0, 0]).reshape(2, -1)
-    change = np.nan_to_num(sides).reshape(2, len(axes), -1)
-    change = (change[0] - change[1]) / np.maximum(known.sum(axis=0), 1)[:, None]
+    change = found_at(params + axes.T) - here
+    if (none := np.isnan(change[:, 0, 0])).any():
+        change[none] = here - found_at(params - axes.T[none])
+    change = np.nan_to_num(change).reshape(len(axes), -1)
     slope = linalg.solve_triangular(axes, change, trans="T", lower=True).T
     if nearby.e.shape[1] == 1:
         by_flux, clusters = np.ascontiguousarray(slope[::3]), profiled.touching.clusters

@@ -59,7 +59,8 @@ class NewtonResult(NamedTuple):
     params : ndarray, shape (d,)
     log_prob : float
     covariance : ndarray, shape (d, d)
-        Inverse of Fisher information plus prior curvature there.
+        Inverse of Fisher information plus prior curvature there, or nearby where the number of
+        steps is limited.
     distance : float
         Length of a Newton step from there in standard deviations, that of the gradient unless the
         prior's support ends before; inf where there is no covariance.
@@ -123,7 +124,7 @@ def maximize(
         try:
             newton = _newton_step(posterior.support, params, gradient, information)
             serves = close_enough < newton.distance < CLOSER * nearest
-            if not is_own and not (serves and evaluations < MOST_EVALUATIONS):
+            if not (is_own or steps or (serves and evaluations < MOST_EVALUATIONS)):
                 information, is_own = posterior.information(params), True
                 newton = _newton_step(posterior.support, params, gradient, information)
         except linalg.LinAlgError:  # a flat prior and a frame that says nothing
@@ -150,7 +151,7 @@ def maximize(
         gains = 0.0 < gain < np.inf
         predicted = way.predicted * fraction * (2.0 - fraction)
         if gains and (steps is not None or gain > AS_PREDICTED * predicted):
-            information = information if steps is None and newton.distance < KEPT else None
+            information = information if newton.distance < KEPT else None
             is_own = False
             continue
         information = None
@@ -162,11 +163,11 @@ def maximize(
         result = _search(posterior, params, value, directions)
         evaluations += result.nfev
         if result.fun < 0.0:
-            params, value = params + directions @ result.x, value - result.fun
+            params = params + directions @ result.x
+            value = float(posterior.log_prob(params))
         elif not gains:
             break
-    log_prob = float(posterior.log_prob(params))
-    return NewtonResult(params, log_prob, newton.covariance, newton.distance, evaluations)
+    return NewtonResult(params, value, newton.covariance, newton.distance, evaluations)
 
 
 def _advance(
@@ -179,14 +180,15 @@ def _advance(
     gain, fraction, evaluations = -np.inf, 1.0, 0
     for fraction in 0.5 ** np.arange(10):
         there = np.clip(params + fraction * way.step, *posterior.support)
-        gain = float(posterior.log_prob(there)) - value
+        higher = float(posterior.log_prob(there))
+        gain = higher - value
         evaluations += 1
         if newton.distance < NEAR and -UNNOTICED < gain <= 0.0:
             # the gradient's root is the maximum: for a model error it is that of log_prob to
             # some hundredths of a standard deviation only
-            return there, value + gain, way.predicted, fraction, evaluations
+            return there, higher, way.predicted, fraction, evaluations
         if 0.0 < gain < np.inf:
-            return there, value + gain, gain, fraction, evaluations
+            return there, higher, gain, fraction, evaluations
     return params, value, gain, fraction, evaluations
 
 

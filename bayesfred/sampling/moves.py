@@ -15,7 +15,7 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.special import gammaln, ndtr
 from scipy.stats import norm, truncnorm
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
@@ -156,12 +156,16 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
             number[k] += len(some)
         return cls(means, covariances, number / number.sum(), posterior.support)
 
-    def draw(self, n: int, random: np.random.RandomState) -> Floats:
-        """n draws from the proposal, shape (n, d)."""
+    def draw(self, n: int, random: np.random.RandomState, heavy: Flags | None = None) -> Floats:
+        """n draws from the proposal, shape (n, d); `heavy` ones are from the share with tails.
+
+        By default chance decides which these are.
+        """
         k = random.choice(len(self.weights), n, p=self.weights)
         z = random.standard_normal((n, self.means.shape[1]))
         stretch = np.sqrt(DEGREES_OF_FREEDOM / random.chisquare(DEGREES_OF_FREEDOM, n))
-        heavy = random.random_sample(n) < self.heavy_share
+        if heavy is None:
+            heavy = random.random_sample(n) < self.heavy_share
         for i in range(len(self.bounds)):
             a, b = self._interval(i, self.means[k], self.lowers[k, i], z)
             z[:, i] = np.where(heavy, z[:, i], truncnorm.ppf(ndtr(z[:, i]), a, b))
