@@ -48,6 +48,7 @@ from bayesfred.optimize.find_map import find_map
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.chainfile import open_chain, write_chain
 from bayesfred.sampling.checkpoints import Checkpoints
+from bayesfred.sampling.ensembles import _Sampler
 from bayesfred.sampling.sampler import Run
 
 HERE = Path(__file__).parent
@@ -327,6 +328,25 @@ def test_an_interrupt_while_saving_waits(
     if kind is Checkpoints:
         assert np.array_equal(open_chain(path).chain, old.chain[:, :6])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class Interrupted:
+    """Random numbers during whose setting a Ctrl-C comes."""
+
+    def set_state(self, state: object) -> None:
+        raise KeyboardInterrupt
+
+
+def test_no_interrupt_is_lost_while_random_numbers_are_set() -> None:
+    """The negative control is emcee's own sampler."""
+    for sampler_of, expected in (
+        (_Sampler, pytest.raises(KeyboardInterrupt)),
+        (emcee.EnsembleSampler, contextlib.nullcontext()),
+    ):
+        sampler = sampler_of(4, 1, lambda params: 0.0)
+        sampler._random = Interrupted()
+        with expected:
+            sampler.random_state = np.random.RandomState(1).get_state()
 
 
 def test_sampling_in_a_thread_takes_no_signals(

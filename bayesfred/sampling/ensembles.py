@@ -91,6 +91,19 @@ class _LogProb:
         return np.where(invalid, -np.inf, values)
 
 
+class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
+    """emcee's sampler, which lets no interrupt pass unseen and no state of random numbers."""
+
+    @property
+    def random_state(self) -> Any:
+        """As RandomState takes it."""
+        return self._random.get_state()
+
+    @random_state.setter
+    def random_state(self, state: Any) -> None:
+        self._random.set_state(state)  # emcee's own setter swallows all that is raised here
+
+
 def begin(
     posterior: TargetDensity, estimate: MapEstimate, seed: int, ensembles: int, walkers: int
 ) -> Step:
@@ -271,7 +284,7 @@ def advance(
             )
             generators = []
             for state in last.states():
-                sampler = emcee.EnsembleSampler(walkers, d, log_prob, moves=moves, vectorize=True)
+                sampler = _Sampler(walkers, d, log_prob, moves=moves, vectorize=True)
                 sampler.log_prob_fn = (
                     log_prob  # emcee's wrapper would print a traceback when interrupted
                 )
