@@ -149,27 +149,26 @@ def find_psf(
     with one_blas_thread():
         if start is not None and start.nodes is not None:
             return _measured_at_nodes(posterior, start)
-        rough = nodes > 0  # then what does not vary is where another search begins
-        begin = start or _start(posterior, estimate, float(oversampling), degree, rough=rough)
-        equations = solved(posterior, begin, rough=rough)
-        if not equations.state.grid.wings:
-            wider = _with_wings(posterior, equations.state)
+        begin = start or _start(posterior, estimate, float(oversampling), degree)
+        state = _near(posterior, begin)
+        if not state.grid.wings:
+            wider = _with_wings(posterior, state)
             if _light_beyond(posterior, wider) > WINGS_SEEN:
-                equations = solved(posterior, wider, exact=False, rough=rough)
+                state = _near(posterior, wider, exact=False)
         if nodes:
-            return _measured_at_nodes(posterior, equations.state.with_nodes(nodes))
-        return _measured(posterior, equations)
+            return _measured_at_nodes(posterior, state.with_nodes(nodes))
+        return _measured(posterior, solved(posterior, state, exact=False))
 
 
 def _start(
-    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int, *, rough: bool
+    posterior: Posterior, estimate: MapEstimate, oversampling: float, degree: int
 ) -> PsfState:
     """Where the search begins: a PSF that does not vary tells which grids it needs."""
     grid = starting_grid(posterior, estimate, oversampling, degree)
     if grid.oversampling == oversampling:
         return starting_state(posterior, estimate, grid)
     constant = starting_state(posterior, estimate, replace(grid, degree=0))
-    known = solved(posterior, constant, rough=rough).state
+    known = _near(posterior, constant)
     suited = suited_grid(grid, known, oversampling)
     if suited is grid and degree == 0:
         return known
@@ -177,6 +176,12 @@ def _start(
         starting_state(posterior, estimate, suited),
         params=known.params, fluxes=known.fluxes, shifts=known.shifts,
     )  # fmt: skip
+
+
+def _near(posterior: Posterior, state: PsfState, *, exact: bool = True) -> PsfState:
+    """A state near the solution, from which another search can begin."""
+    equations = solved(posterior, state, exact=exact, rough=True)
+    return _moved(posterior, equations.state, _change(equations))
 
 
 def solved(
@@ -192,7 +197,7 @@ def solved(
     exact : bool
         Take the model to be exact in the first turns.
     rough : bool
-        Be content with a state from which a PSF that varies can be found.
+        Be content with a state from which another search can begin.
 
     Returns
     -------
@@ -234,15 +239,16 @@ def _followed(posterior: Posterior, equations: PsfEquations) -> PsfEquations:
     Weights follow the light, and fluxes and positions the PSF: steps turn back or lag behind.
     """
     best, points, since = equations, deque[tuple[Floats, Floats, Floats]](maxlen=SECANTS), 0
+    nearest = _far(best)
     while since < PATIENCE:
         points.append((_place(equations.state), _change(equations), equations.measured))
         state = _moved(posterior, equations.state, accelerated(points))
         equations = PsfEquations.of(posterior, state, known=equations)
         far = _far(equations)
         since += 1
-        if far < _far(best):
-            best, since = equations, 0
-        if far < STILL or not far < FARTHER * _far(best):
+        if far < nearest:
+            best, nearest, since = equations, far, 0
+        if far < STILL or not far < FARTHER * nearest:
             break
     return best
 
