@@ -42,9 +42,9 @@ from bayesfred.analysis.comparable import comparable_posteriors, require_sampled
 from bayesfred.analysis.evidence import (
     Evidence,
     draws_needed,
+    evidence_with_ratios,
     importance_evidence,
     random_numbers,
-    with_ratios,
 )
 from bayesfred.analysis.extra_parameters import ExtraParameters, contained, judge_extra
 from bayesfred.analysis.folds import FEWEST
@@ -144,7 +144,7 @@ def compare(chains: Mapping[str, Chain]) -> Comparison:
     for name, chain in chains.items():
         require_sampled(name, chain)
     with one_blas_thread():
-        evidence = {name: with_ratios(chain) for name, chain in chains.items()}
+        evidence = {name: evidence_with_ratios(chain) for name, chain in chains.items()}
         likely = max(chains, key=lambda name: evidence[name][0].log_evidence)
         folds = fold_frames(posteriors[likely], chains[likely].estimate.params, FOLDS)
         require_visible(folds, FEWEST, "to predict some from the others")
@@ -207,7 +207,7 @@ def _ranked(fitted: Mapping[str, _Fitted], folds: FrameFolds) -> Comparison:
 def _left_out(
     chain: Chain, posterior: AnyPosterior, known: tuple[Evidence, Floats], folds: FrameFolds
 ) -> _Fitted:
-    """Leave out fold after fold. What is known is the evidence `with_ratios`."""
+    """Leave out fold after fold; `known` is what `evidence_with_ratios` found."""
     random, start = random_numbers(chain), chain.estimate.params
     found, shapes, gradients, params = [], [], [], []
     evidence, number = known[0], draws_needed(known[1], ENOUGH, DRAWS)

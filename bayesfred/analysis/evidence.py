@@ -47,7 +47,14 @@ from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import effective_size
 from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
 
-__all__ = ["Evidence", "importance_evidence", "log_evidence", "random_numbers"]
+__all__ = [
+    "Evidence",
+    "draws_needed",
+    "evidence_with_ratios",
+    "importance_evidence",
+    "log_evidence",
+    "random_numbers",
+]
 
 PROPOSALS = 1000  # at most
 PRECISE = 0.01  # error of a chain's log-evidence with which fewer do
@@ -113,10 +120,10 @@ def log_evidence(chain: Chain) -> Evidence:
     >>> f"{found.log_evidence:.1f}", found.error < 0.05
     ('-10360.3', True)
     """
-    return with_ratios(chain)[0]
+    return evidence_with_ratios(chain)[0]
 
 
-def with_ratios(chain: Chain) -> tuple[Evidence, Floats]:
+def evidence_with_ratios(chain: Chain) -> tuple[Evidence, Floats]:
     """The evidence as `log_evidence` finds it, and the ratios that it took.
 
     Parameters
@@ -154,7 +161,7 @@ def draws_needed(ratios: Floats, error: float, most: int) -> int:
     Parameters
     ----------
     ratios : ndarray, shape (n,)
-        Of other draws of such a proposal, see `with_ratios`.
+        Of other draws of such a proposal, see `evidence_with_ratios`.
     error : float
     most : int
     """
