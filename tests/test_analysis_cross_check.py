@@ -204,7 +204,9 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=[pytest.mark.slow] if k == "scatter" else []) for k in KINDS]
+)
 def test_right_errors_are_found_right(kind: str) -> None:
     found = checked(6, **KINDS[kind])
     assert found.verdict == "right" and found.holds, found.message

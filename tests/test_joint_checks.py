@@ -255,7 +255,10 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("kind", OPTIONS)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=[pytest.mark.slow] if "scatter" in k else []) for k in OPTIONS],
+)
 def test_one_frame_is_judged_as_a_joint_posterior_as_alone(kind: str) -> None:
     """With every coefficient shared; the scatter is held at the same value either way."""
     off = 0.1 * np.random.default_rng(5).standard_normal((2, 25)) if "scatter" in kind else None

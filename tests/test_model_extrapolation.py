@@ -100,6 +100,7 @@ def draws(best: MapEstimate, sd: float) -> Floats:
 # what costs most to compile is among the long runs
 LONG = {"nuisances", "Moffat", "scattered, model error"}
 COSTLY = dict.fromkeys(LONG, pytest.mark.long) | {"scattered": pytest.mark.slow}
+SCATTERED = pytest.param("scattered", marks=pytest.mark.slow)
 NAMES = [pytest.param(name, marks=COSTLY.get(name, ())) for name in CASES]
 
 
@@ -114,7 +115,7 @@ def test_near_the_maximum_log_prob_is_the_same(case: str) -> None:
             assert np.mean(extrapolated != searched) > 0.5
 
 
-@pytest.mark.parametrize("case", ["touching", "faint", "scattered"])
+@pytest.mark.parametrize("case", ["touching", "faint", SCATTERED])
 def test_far_from_it_log_prob_is_the_same(case: str) -> None:
     posterior, near, best = solved(case)
     for sd in (10.0, 100.0, 1000.0):
@@ -123,7 +124,7 @@ def test_far_from_it_log_prob_is_the_same(case: str) -> None:
         assert extrapolated == pytest.approx(searched, rel=1e-12, abs=ENOUGH)
 
 
-@pytest.mark.parametrize("case", ["touching", "faint", "scattered"])
+@pytest.mark.parametrize("case", ["touching", "faint", SCATTERED])
 def test_a_vector_by_itself_has_the_log_prob_that_it_has_among_others(case: str) -> None:
     """Also where nothing is left to search for, and where all is."""
     _, near, best = solved(case)
@@ -179,6 +180,7 @@ def test_wrong_beliefs_cost_time_alone_unless_they_are_about_the_hessian() -> No
     assert np.abs(alone.log_prob(params) - searched).min() > 10 * AGREE
 
 
+@pytest.mark.slow
 def test_wrong_beliefs_about_shifts_cost_time_alone_unless_they_are_about_the_rest_of_the_way() -> (
     None
 ):
@@ -213,7 +215,13 @@ def test_without_free_fluxes_there_is_nothing_to_extrapolate() -> None:
         assert posterior.near(posterior.start(), np.eye(posterior.n_parameters)) is posterior
 
 
-@pytest.mark.parametrize(("case", "agree"), [("touching", AGREE), ("scattered", SCATTERED_AGREE)])
+@pytest.mark.parametrize(
+    ("case", "agree"),
+    [
+        ("touching", AGREE),
+        pytest.param("scattered", SCATTERED_AGREE, marks=pytest.mark.slow),
+    ],
+)
 def test_a_chain_of_free_fluxes_holds_the_log_prob_of_its_draws(
     case: str, agree: float, tmp_path: Path
 ) -> None:
@@ -251,7 +259,7 @@ def test_a_chain_that_went_far_verifies(tmp_path: Path) -> None:
     assert {check.what: check.holds for check in verify(path)}["log-probability"]
 
 
-@pytest.mark.parametrize("case", ["touching", "scattered"])
+@pytest.mark.parametrize("case", ["touching", SCATTERED])
 def test_copies_keep_the_extrapolation(case: str) -> None:
     """Pickled, copied or with another prior: the same object state, so the same fast answers."""
     _, near, best = solved(case)
