@@ -189,6 +189,24 @@ def test_errors_of_importance_sampling_are_those_quoted(density: TargetDensity) 
     assert np.mean(error**2) / np.mean(np.square(without)) > 1.4
 
 
+def test_few_wide_draws_may_have_missed_the_bound_of_a_prior() -> None:
+    """Of 100 draws five are wide, half of them beyond it: in one set of 16 all of these or none.
+
+    The negative control takes the variance of the five for that of the share.
+    """
+    density, random = CutGaussian(), np.random.RandomState(4)
+    move, z, control = LaplaceMove.of(density, top(density)), [], []
+    for _ in range(400):
+        ratios = module._proposed(density, move, 100, random)
+        found = module._mean(ratios)
+        weights, heavy = np.exp(ratios - found.log_evidence), module._heavy(100)
+        alone = np.where(heavy, weights[heavy].var(), weights[~heavy].var()).mean() / 100.0
+        z.append((found.log_evidence - CUT) / found.error)
+        control.append((found.log_evidence - CUT) / alone**0.5)
+    assert np.abs(z).max() < 5.0 and 0.6 < np.std(z) < 1.4
+    assert np.abs(control).max() > 10.0
+
+
 def test_few_proposals_are_drawn_where_their_error_is_small() -> None:
     """The error with the number that is said to be needed: of 400, to 0.0035 by chance."""
     random, density = np.random.RandomState(4), Tails()

@@ -58,9 +58,9 @@ __all__ = [
 
 PROPOSALS = 1000  # at most
 PRECISE = 0.01  # error of a chain's log-evidence with which fewer do
-PARTS = 10  # of these, after each of which it is compared
+PARTS = 10  # in which these are drawn: after each the error is looked at
 PERIOD = round(1.0 / HEAVY_SHARE)  # draws of which one is from the proposal's share with tails
-MANY = 2  # draws for a parameter, above which it pays to know what is nearby
+MANY = 2  # draws for each parameter, above which it pays to extrapolate free fluxes
 COARSE = 0.3  # error above which a few draws decide
 EVEN = 5.0  # largest weight over their mean: the shape of such a tail is noise, and no matter
 STREAM = 20  # apart from the random numbers that made the chain

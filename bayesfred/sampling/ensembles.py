@@ -92,7 +92,7 @@ class _LogProb:
 
 
 class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
-    """emcee's sampler, which lets no interrupt pass unseen and no state of random numbers."""
+    """emcee's sampler, but whatever is raised while its random numbers are set is raised."""
 
     @property
     def random_state(self) -> Any:
@@ -101,7 +101,7 @@ class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
 
     @random_state.setter
     def random_state(self, state: Any) -> None:
-        self._random.set_state(state)  # emcee's own setter swallows all that is raised here
+        self._random.set_state(state)  # emcee's own setter swallows it, also a Ctrl-C
 
 
 def begin(
