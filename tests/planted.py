@@ -17,7 +17,7 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import GaussianPSF, MoffatPSF, SampledPSF
-from bayesfred.model.noise import simulate
+from bayesfred.model.noise import PoissonNoise, simulate
 from bayesfred.model.parameters import Nuisances
 from bayesfred.model.posterior import Posterior
 
@@ -141,6 +141,28 @@ def banding(seed: int) -> Posterior:
     posterior = true(seed)
     more = np.random.default_rng(seed + 20_000).normal(0.0, 3.0, (SHAPE[0], 1))
     return replace(posterior, counts=np.maximum(np.round(posterior.counts + more), 0.0))
+
+
+def resampled(seed: int) -> Posterior:
+    """The frame was shifted by half a pixel along each axis, by means of four pixels."""
+    model, rng = camera(field(seed)), np.random.default_rng(seed + 20_000)
+    frame = counts(model, seed) + rng.normal(0.0, 3.0, SHAPE)
+    frame = 0.25 * sum(np.roll(frame, (-i, -j), (0, 1)) for i in (0, 1) for j in (0, 1))
+    wider = replace(model, psf=GaussianPSF((SIGMA**2 + 0.25) ** 0.5))
+    noise = PoissonNoise(read_noise=3.0)
+    return Posterior(wider, frame, noise=noise, nuisances=Nuisances(offset=True))
+
+
+def varying_psf(seed: int) -> Posterior:
+    """Images are wider the farther out they are, by a third at the frame's edge."""
+    model = camera(field(seed))
+    s, expected = model.sources, np.full(SHAPE, LEVEL)
+    for x, y, flux in zip(s.x, s.y, s.flux, strict=True):
+        own = GaussianPSF(SIGMA * (1.0 + (x * x + y * y) / (3.0 * HALF**2)))
+        one = camera(SourceCatalog([x], [y], [flux]), psf=own)
+        expected += one.expected_counts(THETA, 0.0)
+    frame = np.random.default_rng(seed + 20_000).poisson(expected).astype(float)
+    return Posterior(model, frame, nuisances=Nuisances("free", psf_sigma=True))
 
 
 def narrow_psf_on_grid(seed: int) -> Posterior:
@@ -341,6 +363,7 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "two amplifiers": (two_amplifiers, ("alternating pixels",)),
     "dead columns": (dead_columns, ("rows or columns",)),
     "banding": (banding, ("rows or columns",)),
+    "resampled": (resampled, ("correlated pixels",)),
     "background": (background, ("background",)),
     "origin": (origin, ("origin",)),
     "parity": (parity, ("parity",)),
@@ -364,6 +387,7 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "a factor of all fluxes": (flux_scale, ("fluxes",)),
     "PSF too wide": (wide_psf, ("PSF",)),
     "PSF with wings": (moffat_psf, ("PSF",)),
+    "PSF that varies": (varying_psf, ("PSF",)),
     "pixels taken for points": (undersampled, ("PSF",)),
     "PSF too narrow, on a grid": (narrow_psf_on_grid, ("PSF",)),
 }

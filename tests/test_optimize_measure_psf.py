@@ -77,6 +77,35 @@ def test_a_source_that_shows_its_wings_alone_is_masked_with_a_model_error():
         assert found.mask[distance > 12.0].all()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_frame_without_a_background_has_a_psf(degree: int) -> None:
+    """Its wings are known to some counts, so that means would be below 0."""
+    pinholes = bf.SourceCatalog.grid(8, 16.0, FLUX)
+    lens = bf.PolynomialDistortion([(1, 0, 0, 0)], [(0, 1, 0, 0)])
+    detector, rng = bf.Detector((137, 137), pixel="box"), np.random.default_rng(1)
+    mean = bf.ForwardModel(detector, pinholes, bf.GaussianPSF(1.5), lens).expected_counts(
+        THETA, 0.0
+    )
+    posterior = bf.Posterior(
+        bf.ForwardModel(detector, pinholes, bf.GaussianPSF(1.3), lens),
+        rng.poisson(mean) + rng.normal(0.0, 5.0, mean.shape),
+        noise=bf.PoissonNoise(read_noise=5.0),
+        nuisances=bf.Nuisances(flux="free", offset=True),
+    )
+    rough = bf.find_map(posterior)
+    psf, state, _ = measuring.find_psf(posterior, rough, 4, degree, 0)
+    # the control: as the PSF is
+    assert not np.isfinite(posterior.with_psf(psf).log_prob(state.params))
+    found, estimate = bf.measure_psf(posterior, rough, degree=degree)
+    assert estimate.fits_data
+    known = dict(zip(found.parameter_names, estimate.params, strict=True))
+    sd = dict(zip(found.parameter_names, np.sqrt(np.diag(estimate.covariance)), strict=True))
+    for name, value in zip(("f_x", "g_y"), THETA, strict=True):
+        assert abs(known[name] - value) < 4.0 * sd[name]
+    assert known["background"] < 0.5
+
+
 def test_a_wrong_background_is_no_error_of_the_light():
     """Of 1,000 bright pixels and 50,000 faint ones, whose background is off by two deviations."""
     rng, error = np.random.default_rng(1), 0.05

@@ -25,21 +25,24 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.absorbed import absorbed
 from bayesfred.analysis.checks import Check, deviate, not_tested
 from bayesfred.analysis.pixel_phase import PixelPhase, phase_check, pixel_phase
 from bayesfred.analysis.score_tests import ScoreTests, score_tests
+from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
 from bayesfred.analysis.source_tests import SourceTests, source_tests
 from bayesfred.analysis.sources import SourceFits, fit_sources, tabulate
 from bayesfred.io.summary_table import Table
 from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
+from bayesfred.optimize.matched import image_width
 
 __all__ = ["Residuals", "judge_residuals", "predictive_checks", "randomised_pit"]
 
 BINS = 20  # of the PIT's histogram
 FEWEST_IN_BIN = 5
+DARK = 0.1  # standard deviations of a pixel, below which its sources' light counts as none
 PREDICTED = ("deviance", "Pearson", "largest residual", "PIT")
 
 
@@ -59,6 +62,8 @@ class Residuals:
         Of what the model does not fit.
     tests : SourceTests
         Of every source.
+    shared : SharedNoise or None
+        How far neighbouring pixels between the sources are correlated, where that matters.
     checks : tuple of Check
         All of these in one number each.
     """
@@ -68,6 +73,7 @@ class Residuals:
     phases: tuple[PixelPhase, PixelPhase]
     scores: ScoreTests
     tests: SourceTests
+    shared: SharedNoise | None
     checks: tuple[Check, ...]
 
 
@@ -98,17 +104,19 @@ def judge_residuals(
     tests = source_tests(posterior, params, covariance, fits, taken)
     sources = tabulate(posterior, fits)
     sources["failed"] = tests.failed
+    z, quiet = _standardised(posterior, params, fits)
     return Residuals(
         sources,
         pit,
         phases,
         scores,
         tests,
+        shared_noise(z, quiet, image_width(posterior, params)),
         (
             *scores.checks,
             *tests.checks,
             pit_check(pit),
-            *_whiteness(posterior, params, fits, taken.modes),
+            *_whiteness(posterior, z, fits, taken.modes),
             *(phase_check(phase, axis) for phase, axis in zip(phases, "uv", strict=True)),
         ),
     )
@@ -189,18 +197,26 @@ def pit_check(pit: Floats | None) -> Check:
 # --- whiteness ------------------------------------------------------------------------------------
 
 
+def _standardised(posterior: Posterior, params: Floats, fits: SourceFits) -> tuple[Floats, Flags]:
+    """Residuals in standard deviations, 0 where masked; and which pixels lie between the sources.
+
+    Both of shape (ny, nx).
+    """
+    used = posterior.mask
+    residual, quiet = np.zeros(used.shape), np.zeros(used.shape, bool)
+    noise, mean = posterior.noise_at(params).at(used), fits.expected[used]
+    level = float(params[posterior.parameter_names.index("background")])
+    residual[used] = noise.residual(posterior.counts[used], mean, level)
+    light = np.abs(mean - posterior.likelihood.background(params)[used])
+    quiet[used] = light < DARK * np.sqrt(noise.counts_variance(mean, level))
+    return residual, quiet
+
+
 def _whiteness(
-    posterior: Posterior, params: Floats, fits: SourceFits, modes: Floats
+    posterior: Posterior, residual: Floats, fits: SourceFits, modes: Floats
 ) -> list[Check]:
     """Correlations of residuals one and two pixels apart, along u and along v."""
     used = posterior.mask
-    residual = np.zeros(used.shape)
-    level = float(params[posterior.parameter_names.index("background")])
-    residual[used] = (
-        posterior.noise_at(params)
-        .at(used)
-        .residual(posterior.counts[used], fits.expected[used], level)
-    )
     background = len(posterior.nuisances.background_names)
     checks = []
     for lag in (1, 2):

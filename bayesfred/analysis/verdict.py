@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.analysis.causes import Cause, find_causes, hidden_causes
+from bayesfred.analysis.causes import Cause, correlated_pixels, find_causes, hidden_causes
 from bayesfred.analysis.causes.cause import psf_remedy
 from bayesfred.analysis.residuals import Residuals
 from bayesfred.optimize.estimate import MapEstimate
@@ -74,8 +74,8 @@ def judge_fit(
 
     It does where deviance and Pearson's statistic are within 5 standard deviations of their
     expectations, enough sources are matched (see `bayesfred.optimize.matched`), neither a score
-    test nor a source fails, the maximum was not found by rejecting a large part of the sources,
-    and no other pose of a frame on the sky fits as well.
+    test nor a source fails, pixels between the sources share no noise, the maximum was not found by
+    rejecting a large part of the sources, and no other pose of a frame on the sky fits as well.
     Of true models at most 1 % fail, all tests together.
 
     Parameters
@@ -103,6 +103,8 @@ def judge_fit(
         failures = _failures(residuals)
         if not consist:
             causes = find_causes(posterior, params, rejected=rejected)
+        elif residuals.shared is not None:
+            causes = (correlated_pixels(residuals.shared),)
         causes = causes or hidden_causes(posterior, params, residuals.scores, residuals.tests)
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
@@ -254,7 +256,8 @@ def _sum(fit: Mapping[str, float], name: str) -> str:
 def _failures(residuals: Residuals) -> str:
     """The score tests and the sources that fail, in words."""
     scores, tests = residuals.scores, residuals.tests
-    parts = [
+    parts = ["neighbouring pixels share noise"] if residuals.shared is not None else []
+    parts += [
         f"{lead.name} is {abs(lead.z):.0f} standard deviations from zero score"
         for lead in scores.leading[:1]
     ]

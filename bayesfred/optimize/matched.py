@@ -75,6 +75,14 @@ class SourceLight:
         return float(power @ self.ratio[self.inside]) / total**0.5 if total > 0.0 else 0.0
 
 
+def image_width(posterior: Posterior, params: Floats) -> float:
+    """Standard deviation of an image along an axis, the pixel in it, recorded pixel."""
+    known = dict(zip(posterior.parameter_names, params, strict=True))
+    model = posterior.model
+    sigma = known.get("psf_sigma", model.psf.sigma) / model.detector.binning
+    return float(np.hypot(sigma, 12.0**-0.5))
+
+
 def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     """Look for the sources' light at given parameters.
 
@@ -100,7 +108,7 @@ def source_light(posterior: Posterior, params: Floats) -> SourceLight:
     model, field = posterior.model, Field(posterior)
     detector, step = model.detector, model.detector.binning
     known = dict(zip(posterior.parameter_names, params, strict=True))
-    s = float(np.hypot(known.get("psf_sigma", model.psf.sigma) / step, 12.0**-0.5))
+    s = image_width(posterior, params)
     position = field.predict(params[field.columns]) / step
     place = (position + 0.5 * (np.array(detector.shape[::-1]) - 1.0))[:, ::-1]
     noise_at, sums = posterior.noise_at(params), np.zeros((5, len(position)))

@@ -29,6 +29,7 @@ ROUNDS = 3  # of measuring a PSF without what it does not explain, or with the s
 OFF = 0.2  # of the scatter of positions with which a PSF was measured
 FEW = 0.1  # of the sources, which may be lost so
 MOST = 4  # a degree, beyond which the equations of a PSF take minutes
+DARKEST = 1e-3  # expected counts of a pixel to begin with
 NODES, EACH = 7, 10  # a number of nodes, and of the sources at each that they take
 
 
@@ -178,7 +179,22 @@ def _with(
     if bare.nuisances.model_error:
         # a source that shows its wings alone has any flux whose error covers what is wrong there
         bare = replace(bare, mask=lit_pixels(posterior, state), extrapolation=None)
+    if not np.isfinite(bare.log_prob(start)):
+        # its equations do not know that no mean is below 0, which in a dark frame its wings may be
+        bare = bare.with_psf(_not_negative(psf))
+        start = np.clip(start, *bare.support)
+        darkest = bare.expected_counts(start)[bare.mask].min()
+        start[bare.parameter_names.index("background")] += max(DARKEST - darkest, 0.0)
     return bare, start
+
+
+def _not_negative(psf: MeasuredPSF) -> MeasuredPSF:
+    """That which is nowhere on the field below 0: of what varies no more than the constant has."""
+    first, rest = np.maximum(psf.coefficients[0], 0.0), psf.coefficients[1:]
+    sizes = np.abs(rest)
+    most = sizes.max(axis=0, initial=0.0) if psf.nodes else sizes.sum(axis=0)
+    kept = np.minimum(first / np.maximum(most, 1e-300), 1.0)
+    return replace(psf, coefficients=np.concatenate([first[None], kept * rest]))
 
 
 def _as_measured(posterior: Posterior, params: Floats, state: PsfState) -> tuple[Posterior, Floats]:

@@ -10,6 +10,7 @@ from bayesfred.analysis.causes.context import BRIGHT, Context
 
 RINGS, REACH = 8, 4.0  # around each image, and their outer radius in PSF widths
 FEW = 12  # sources that do not tell a pattern that is linear over the field
+QUADRATIC = 36  # sources that tell one of the second degree
 FEWEST = 5  # pixels of a ring
 
 
@@ -48,8 +49,8 @@ def common_pattern(context: Context, orders: Iterable[int]) -> CommonPattern | N
     ----------
     context : Context
     orders : iterable of int
-        Of the harmonics of the angle along a ring, 0 first. Each is constant or linear over the
-        field.
+        Of the harmonics of the angle along a ring, 0 first. Each varies over the field with a
+        degree of 0, 1 or 2, as the number of sources allows.
 
     Returns
     -------
@@ -74,7 +75,8 @@ def common_pattern(context: Context, orders: Iterable[int]) -> CommonPattern | N
     ring = (radius / (REACH * s) * RINGS).astype(int)
     x, y = (c / (0.5 * shape.max()) for c in light.position[source].T)
     shapes = [f(m * angle) for m in orders for f in ((np.cos, np.sin) if m else (np.cos,))]
-    over = [np.ones(z.size)] if good.sum() < FEW else [np.ones(z.size), x, y]
+    over = [np.ones(z.size), x, y, x * x, x * y, y * y]
+    over = over[: 1 if good.sum() < FEW else 3 if good.sum() < QUADRATIC else 6]
     pattern, explained, profile = np.zeros(z.size), 0.0, np.zeros(RINGS)
     for k in range(RINGS):
         here = ring == k

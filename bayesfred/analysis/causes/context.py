@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, spatial
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.noise import Noise
@@ -17,6 +17,7 @@ DETECTED = 5.0  # standard deviations of a detection
 NEARBY = 0.1  # share of the light around it that a detection exceeds, or it is a wing
 LEAST = 0.1  # of expected counts, to which an earlier cause may lower them
 BRIGHT = 64.0  # squared signal to noise of a source that has to be seen
+AROUND = 12  # sources, as whose typical one those near a source count
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,12 +213,21 @@ class Context:
         return self.per_source(self.z**2) - self.source_pixels
 
     @cached_property
-    def typical(self) -> float:
-        """Misfit of a typical matched source, in units of its squared signal to noise."""
-        some = self.light.matched & (self.power > BRIGHT)
-        if not some.any():
-            return 0.0
-        return max(float(np.median(self.source_excess[some] / self.power[some])), 0.0)
+    def typical(self) -> Floats:
+        """Misfit of a typical source, in units of its squared signal to noise, shape (n,).
+
+        The median of matched ones, or of those nearby if it is larger: a PSF may be wrong in one
+        part of the frame.
+        """
+        some = np.flatnonzero(self.light.matched & (self.power > BRIGHT))
+        if not some.size:
+            return np.zeros(self.flux.size)
+        each = self.source_excess[some] / self.power[some]
+        place = np.where(np.isfinite(self.light.position), self.light.position, 0.0)
+        number = min(AROUND, some.size)
+        _, near = spatial.cKDTree(place[some]).query(place, number)
+        nearby = np.median(each[near.reshape(-1, number)], axis=1)
+        return np.asarray(np.maximum(nearby, max(float(np.median(each)), 0.0)))
 
     @cached_property
     def detections(self) -> Detections:

@@ -11,6 +11,7 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.common import common_pattern
 from bayesfred.analysis.causes.context import Context
+from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
 from bayesfred.model.noise import PoissonNoise
 
 FEWEST_FULL = 3  # equal pixels at the top that are a pile
@@ -160,8 +161,31 @@ def lines(context: Context) -> tuple[list[Finding], Context]:
     return findings, context
 
 
+def correlated_pixels(shared: SharedNoise) -> Cause:
+    """Noise that neighbouring pixels share, about which hardly anything else can be said."""
+    along_u, along_v = shared.along
+    return Cause(
+        "correlated pixels", 1.0,
+        f"neighbouring pixels between the sources share noise (correlation {along_u:.2f} along u, "
+        f"{along_v:.2f} along v), as in frames that were resampled, smoothed or sharpened: errors "
+        f"of positions are {shared.factor:.2g} times those with independent pixels",
+        "fit the frame as the detector recorded it",
+    )  # fmt: skip
+
+
 def background_and_noise(context: Context) -> Iterator[Finding]:
     """What pixels far from all sources say of the background and of the noise."""
+    shared = shared_noise(context.z, context.quiet, context.light.width)
+    if shared is None:
+        yield from _independent(context)
+        return
+    # what independent pixels would say of both is said of the correlation
+    explained = sum(finding.explained for finding in _independent(context))
+    yield Finding(correlated_pixels(shared), explained, "noise")
+
+
+def _independent(context: Context) -> Iterator[Finding]:
+    """The same of pixels that share no noise."""
     mean, scatter, size, place = _tiles(context)
     if mean.size < FEWEST_TILES:
         return
