@@ -234,6 +234,18 @@ def far_missing_terms(seed: int) -> Posterior:
     return Posterior(camera(s), counts(camera(moved(s, x, y)), seed))
 
 
+def fisheye(seed: int) -> Posterior:
+    """A cubic lens where the true one has terms of the fifth degree, which few sources show."""
+    terms = [(i, d - i, 0, 0) for d in (1, 2, 3) for i in range(d, -1, -1)]
+    model = camera(field(seed, 60), distortion=PolynomialDistortion(terms, terms))
+    x, y = model.sources.x / HALF, model.sources.y / HALF
+    r2 = x * x + y * y
+    more = 8.0 * r2**2 - 20.0 * r2
+    true_field = moved(model.sources, model.sources.x + more * x, model.sources.y + more * y)
+    frame = counts(replace(model, sources=true_field), seed)
+    return Posterior(model, frame, nuisances=Nuisances("free"))
+
+
 def unmatched(seed: int) -> Posterior:
     """The catalogue is of another field; every flux is free."""
     return Posterior(
@@ -374,6 +386,7 @@ FAULTS: dict[str, tuple[Callable[[int], Posterior], tuple[str, ...]]] = {
     "scale": (scale, ("rotation or scale",)),
     "missing terms": (missing_terms, ("missing terms",)),
     "missing terms of 12 pixels": (far_missing_terms, ("missing terms",)),
+    "missing terms, at the rim": (fisheye, ("missing terms",)),
     "another field": (unmatched, ("unmatched",)),
     "no light": (empty, ("unmatched",)),
     "wrong positions of few": (wrong_sources, ("wrong sources",)),

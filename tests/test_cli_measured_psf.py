@@ -10,6 +10,8 @@ from test_cli import Output, assert_refused, invoke
 
 import bayesfred as bf
 from bayesfred.analysis.verify import verify
+from bayesfred.commands import pipeline
+from bayesfred.errors import InputError
 from bayesfred.sampling.chainfile import open_chain
 
 pytestmark = pytest.mark.slow
@@ -190,3 +192,32 @@ def test_photutils_renders_the_same_psf() -> None:
     np.testing.assert_allclose(values, tilted.density(*at, at=place), atol=1e-3 * psf.peak)
     with pytest.raises(bf.InputError, match="shape"):
         tilted.to_photutils()
+
+
+def test_where_no_psf_is_found_other_causes_are_told(
+    frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The corners are dark, and the search for a PSF does not end."""
+
+    def refuse(*given: object, **named: object) -> None:
+        raise InputError("psf: no PSF found in 40 turns")
+
+    monkeypatch.setattr(pipeline, "measure_psf", refuse)
+    v, u = np.indices((127, 127)) - 63.0
+    dark = np.where(np.hypot(u, v) < 70.0, 1.0, 0.05) * np.load(frames / "one.npy")
+    np.save(frames / "corners.npy", np.round(dark))
+    text = RUN.format(frame="corners.npy", psf=MEASURED, output="corners.h5")
+    (frames / "corners.toml").write_text(text, encoding="utf-8")
+    output = invoke(frames, "fit", "corners.toml", "--map-only")
+    said = "no PSF found in 40 turns. Or it is the background: "
+    assert_refused(output, said, "set nuisances.background_order = 2")
+
+
+def test_dark_marks_are_told_before_the_fit(frames: Path) -> None:
+    counts = np.load(frames / "one.npy")
+    np.save(frames / "marks.npy", np.maximum(counts.max() + 1e3 - counts, 0.0))
+    text = RUN.format(frame="marks.npy", psf="sigma = 1.5", output="marks.h5")
+    (frames / "marks.toml").write_text(text, encoding="utf-8")
+    output = invoke(frames, "fit", "marks.toml", "--map-only")
+    assert output.code == 3
+    assert "the marks are darker than the ground" in output.stdout

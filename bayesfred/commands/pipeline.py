@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from bayesfred import build, settings
+from bayesfred.analysis.causes import find_causes
 from bayesfred.analysis.choose_terms import choose_terms
 from bayesfred.build import naming
 from bayesfred.commands.records import Result
 from bayesfred.commands.results import How, Job, Say, make_chain, write_results
+from bayesfred.errors import InputError
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure, has_pixel
 from bayesfred.io import outputs, paths
 from bayesfred.io.frames import FrameRecord
@@ -23,6 +25,7 @@ from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import refuse_nodes
 from bayesfred.optimize.alternating import alternating_message
+from bayesfred.optimize.dark_marks import dark_marks_message
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, reject_outliers
 from bayesfred.optimize.follow import followed_images
@@ -133,17 +136,19 @@ def read_doubted(
         path, maps, gain=f.gain, pedestal=f.pedestal, saturation=f.saturation, name=f.name
     )
     noise, line = build.noise_given(run, run_file, maps, frame.read_noise)
-    note(frame.description, line, alternating_message(frame.counts, frame.valid))
-    shape = (frame.counts.shape[0], frame.counts.shape[1])
+    warnings = [
+        tell(frame.counts, frame.valid) for tell in (alternating_message, dark_marks_message)
+    ]
+    note(frame.description, line, *warnings)
     psf = psf or _reference_psf(run, run_file)
     psf, frame, lines = _by_its_peaks(run, psf, frame, noise)
     note(*lines)
     with working("finding the sources", show=say is not None):
-        sources, lines, ambiguous = find_sources(run, run_file, shape, psf, frame)
+        sources, lines, ambiguous = find_sources(run, run_file, frame.counts.shape, psf, frame)
     note(*lines)
     counts, noise = bright(run, run_file, frame, noise)
     with naming(run_file):
-        model = build.forward_model(run, shape, sources, psf)
+        model = build.forward_model(run, frame.counts.shape, sources, psf)
         posterior = build.posterior_given(run, model, counts, frame.valid, noise)
         estimate, rough = None, isinstance(psf, PSFToMeasure)
         if posterior.nuisances.footprint is not None:
@@ -233,13 +238,26 @@ def _with_measured_psf(
     """The posterior with the errors of its PSF, which is measured first if that is asked for."""
     estimate = estimate or find_map(posterior)
     if isinstance(psf, PSFToMeasure):
-        return measure_psf(
-            posterior, estimate, oversampling=psf.oversampling, degree=psf.degree,
-            nodes=psf.nodes, model_error=run.nuisances.model_error, prior=build.priors_given(run),
-            reject_outliers=run.frame.reject_outliers,
-        )  # fmt: skip
+        try:
+            return measure_psf(
+                posterior, estimate, oversampling=psf.oversampling, degree=psf.degree,
+                nodes=psf.nodes, model_error=run.nuisances.model_error,
+                prior=build.priors_given(run), reject_outliers=run.frame.reject_outliers,
+            )  # fmt: skip
+        except InputError as error:
+            others = _other_causes(posterior, estimate, run.frame.reject_outliers)
+            raise InputError(f"{error}{others}") from None
     posterior = marginalize_psf(posterior, estimate)
     return posterior, find_map(posterior, estimate.params)
+
+
+def _other_causes(posterior: Posterior, estimate: MapEstimate, rejected: bool) -> str:
+    """What else is wrong than the PSF, where none could be measured, and what to do about it."""
+    causes = find_causes(posterior, estimate.params, rejected=rejected)
+    for cause in causes:
+        if cause.name != "PSF":
+            return f". Or it is the {cause.name}: {cause.sentence}: {cause.remedy}"
+    return ""
 
 
 def _rejected(given: Posterior, kept: Posterior, estimate: MapEstimate | None) -> str:

@@ -65,7 +65,7 @@ def find_causes(
         findings += [place, *background_and_noise(context)]
         if place is None or place.cause.name != "unmatched":
             findings += [fluxes(context), psf(context), companions(context), scatter(context)]
-            findings += single_sources(context)
+            findings += single_sources(context, place)
     else:
         findings += [unmatched(context), *background_and_noise(context)]
     return ranked([f for f in findings if f is not None], total)

@@ -6,12 +6,20 @@ taken off before companions are looked for.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from bayesfred._typing import Flags, Floats
-from bayesfred.analysis.causes.cause import RICHER, Cause, Finding, psf_remedy
+from bayesfred.analysis.causes.cause import (
+    BY_CHANCE,
+    MISSING,
+    RICHER,
+    Cause,
+    Finding,
+    psf_remedy,
+)
 from bayesfred.analysis.causes.common import REACH, RINGS, common_pattern
 from bayesfred.analysis.causes.context import BRIGHT, DETECTED, Context
 
@@ -53,8 +61,12 @@ def fluxes(context: Context) -> Finding | None:
     return Finding(cause, own, "light", RICHER)
 
 
-def single_sources(context: Context) -> Iterator[Finding]:
-    """Few sources that hold most of the misfit, and light that belongs to no source."""
+def single_sources(context: Context, place: Finding | None) -> Iterator[Finding]:
+    """Few sources that hold most of the misfit, and light that belongs to no source.
+
+    `place` is what is wrong with the images' places: where terms are missing, few sources are the
+    outermost ones.
+    """
     light, excess = context.light, context.source_excess
     power = np.maximum(context.power, context.catalogue_power * light.inside)
     dark = context.bright & ~light.matched
@@ -74,12 +86,14 @@ def single_sources(context: Context) -> Iterator[Finding]:
         leave_out = "leave them out" if context.rejected else REJECT
         dim = f", {dark.sum()} of them with no light at their image" if dark.any() else ""
         more = ", ..." if wrong.sum() > len(order) else ""
+        held = f"{wrong.sum()} of {light.inside.sum()} sources hold the misfit{dim}"
         cause = Cause(
-            "wrong sources", 0.0,
-            f"{wrong.sum()} of {light.inside.sum()} sources hold the misfit{dim}: rows of the "
-            f"catalogue, from 0: {names}{more}",
+            "wrong sources", 0.0, f"{held}: rows of the catalogue, from 0: {names}{more}",
             f"correct their positions and fluxes, or {leave_out}",
         )  # fmt: skip
+        if place is not None and place.cause.name == MISSING and _outermost(context, wrong):
+            lacking = f"{place.cause.sentence}; {held}, and they are the outermost"
+            cause = replace(place.cause, sentence=lacking)
         explained = float(own.sum() + found.power[near].sum())
         yield Finding(cause, explained, "position")
     rest = found.power[len(near) and near.sum() :]
@@ -93,6 +107,15 @@ def single_sources(context: Context) -> Iterator[Finding]:
             else f"{REJECT}, or footprint, or complete the catalogue",
         )  # fmt: skip
         yield Finding(cause, float(rest.sum()), "position")
+
+
+def _outermost(context: Context, some: Flags) -> bool:
+    """Whether sources lie farther out than the others."""
+    position, inside = context.light.position, context.light.inside
+    radius = np.hypot(*(position - np.mean(position[inside], axis=0)).T)
+    others = inside & ~some
+    test = stats.mannwhitneyu(radius[some], radius[others], alternative="greater")
+    return bool(test.pvalue < BY_CHANCE)
 
 
 def psf(context: Context) -> Finding | None:

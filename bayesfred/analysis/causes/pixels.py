@@ -25,6 +25,7 @@ AROUND = 9  # lines, among which one is compared
 FEW_LINES = 0.05  # of the lines: more than these are all
 NAMED = 5  # lines listed
 LINES = "rows or columns"
+MENDED = 0.8  # of what is wrong with a background, or a polynomial is no remedy
 STEEPEST = (
     30.0  # times the background's, to which noise in proportion to the counts is extrapolated
 )
@@ -248,7 +249,7 @@ def _background(
     smooth = float(np.sum((root * (design @ found)) ** 2))
     excess = held / float(np.sum(size))  # of what the noise of so few pixels makes of the means
     by = float((excess * np.median(context.variance[context.used])) ** 0.5)
-    mends = order < 2 and smooth > 0.5 * held
+    mends = order < 2 and smooth > MENDED * held
     cause = Cause(
         "background", 0.0,
         f"the background between the sources differs from the model's by {by:.2g} counts a pixel "

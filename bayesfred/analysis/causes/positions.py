@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.causes.cause import (
+    MISSING,
     RICHER,
     Cause,
     Finding,
@@ -191,7 +192,7 @@ def _patterns(context: Context, measured: Displaced, how: str = "") -> Finding |
     if gains[-1] < 5.0 * numbers[-1] * max(each, 1.0):
         return None
     level = int(np.argmax(np.array(gains) >= ENOUGH * max(gains)))
-    name = ("own", "shift", "rotation or scale", "missing terms")[min(level, 3)]
+    name = ("own", "shift", "rotation or scale", MISSING)[min(level, 3)]
     explained = gains[level] - numbers[level]
     taken = rests[0] - rests[level] if level else measured.displacement
     size = np.hypot(*taken.T)

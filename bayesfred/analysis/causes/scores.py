@@ -15,6 +15,8 @@ from scipy import stats
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.causes.cause import (
+    BY_CHANCE,
+    MISSING,
     RICHER,
     Cause,
     Finding,
@@ -30,8 +32,7 @@ from bayesfred.imaging.monomials import degree_of
 from bayesfred.model.posterior import Posterior
 
 NOISE = 2.0  # standard deviations by which a spread has to explain more than chance
-BY_CHANCE = 1e-4  # that so many of the brightest are among few sources
-MORE_TERMS = ("missing terms", "")
+MORE_TERMS = (MISSING, "")
 # The cause, and what frees a number that a score test finds wrong, by the beginning of its name.
 REMEDIES = {
     "flux_scale": ("fluxes", 'set nuisances.flux = "scale"'),
@@ -93,7 +94,7 @@ def hidden_causes(
         cause = Cause("PSF", 0.0, text, psf_remedy(posterior, "fit another PSF"))
         findings.append(Finding(cause, profile, "PSF", RICHER))
     others = squares[~tests.failed] if few else squares
-    smooth = sum(finding.explained for finding in findings if finding.cause.name == MORE_TERMS[0])
+    smooth = sum(finding.explained for finding in findings if finding.cause.name == MISSING)
     for spread in tests.failed_spreads:
         kind, text = SPREADS[spread.name]
         remedy, pixel, taken = 'set nuisances.flux = "free"', 1.0, 0.0
