@@ -14,6 +14,12 @@ If all share one phi, S_i is the covariance of b_i and
 G_j what the errors of frame j's PSF add. t_i^T (Cov t_i)^-1 t_i is a chi-square with as many
 degrees of freedom as there are directions of which frame i tells something and the others too.
 
+Where positions scatter, or a model is in error, S_i depends on scales that few sources tell: of 30
+sources whose positions scatter it is known to a third or less. Frames that would disagree are asked
+again with scales from a grid, each with the probability that its likelihood and prior give it, once
+what else is unknown is integrated out in the approximation. Of a normal mean with an unknown
+variance that is Student's test.
+
 The frame with the least probability is left out while it is below `CHANCE` over the number of
 frames, and the others are asked again without it: a frame of another instrument pulls the shared
 parameters, so that at first all disagree.
@@ -21,21 +27,24 @@ parameters, so that at first all disagree.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, stats
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Flags, Floats
 from bayesfred.model.joint import JointPosterior
 from bayesfred.optimize.estimate import inverse
-from bayesfred.optimize.joint_map import schur_complements
 
 __all__ = ["FrameAgreement", "frame_agreement"]
 
 CHANCE = 0.01  # probability that frames of one instrument are said to disagree
 TOLD = 1e-3  # share of what is known of a direction that the frame, and the others, tell at least
 MOST_NAMED = 5
+SCALES = ("position_scatter", "model_error")
+NODES = np.linspace(-1.6, 1.6, 5)  # of the grid, about a scale's logarithm
+DRAWS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,38 +120,84 @@ def frame_agreement(joint: JointPosterior, params: Floats) -> FrameAgreement:
     >>> frame_agreement(joint, bf.find_map(joint).params).odd
     ('c',)
     """
-    p, names = joint.n_shared, tuple(joint.frames)
-    prior = np.diag(joint.prior_curvature(params)[:p])
-    told = schur_complements(joint, params)
-    scale = 1.0 / np.sqrt(np.diag(sum(told, prior)))
-    told = [each * np.outer(scale, scale) for each in told]
-    prior = prior * np.outer(scale, scale)
-    centre, slope = params[:p] / scale, joint.prior_gradient(params)
-    curvature = joint.prior_curvature(params)
-    pulls, excess = [], []
-    for k, (name, part, (gradient, fisher)) in enumerate(
-        zip(names, joint.parts, joint.derivatives(params), strict=True)
-    ):
-        score = part.matrix.T @ gradient
-        if part.own.size:
-            own = fisher[np.ix_(part.places, part.places)] + np.diag(curvature[part.own])
-            cross = part.matrix.T @ fisher[:, part.places]
-            score -= cross @ inverse(own) @ (gradient[part.places] + slope[part.own])
-        pulls.append(score * scale + told[k] @ centre)
-        excess.append(_psf_excess(joint, name, told[k], scale))
-    of_prior = prior, slope[:p] * scale + prior @ centre
-    frames = _Paraboloids(told, pulls, excess, of_prior)
+    scales = np.array([name.endswith(SCALES) for name in joint.parameter_names])
+    agreement = _agreement(joint, [_paraboloids(joint, params, ~scales)])
+    if agreement.agree or not scales.any():
+        return agreement
+    return _agreement(joint, _of_scales(joint, params, scales))
+
+
+def _agreement(joint: JointPosterior, several: "Sequence[_Paraboloids]") -> FrameAgreement:
+    """From probabilities that are averaged over approximations of the likelihood."""
+    names = tuple(joint.frames)
+
+    def chance(i: int, inside: Sequence[int]) -> float:
+        return float(np.mean([frames.chance(i, inside) for frames in several]))
+
     inside, odd = list(range(len(names))), list[int]()
     while True:
-        found = {i: frames.chance(i, inside) for i in inside}
-        tested = {i: chance for i, chance in found.items() if np.isfinite(chance)}
+        found = {i: chance(i, inside) for i in inside}
+        tested = {i: each for i, each in found.items() if np.isfinite(each)}
         worst = min(tested, key=lambda i: tested[i], default=-1)
         if worst < 0 or tested[worst] >= CHANCE / len(names) or len(inside) < 2:
             break
         inside.remove(worst)
         odd.append(worst)
-    every = np.array([frames.chance(i, sorted({*inside, i})) for i in range(len(names))])
+    every = np.array([chance(i, sorted({*inside, i})) for i in range(len(names))])
     return FrameAgreement(names, every, tuple(names[i] for i in sorted(odd)))
+
+
+def _of_scales(joint: JointPosterior, params: Floats, scales: Flags) -> "list[_Paraboloids]":
+    """Approximations whose scales are drawn, frame by frame, from their posterior on a grid."""
+    kinds = [np.array([n.endswith(kind) for n in joint.parameter_names]) for kind in SCALES]
+    kinds = [kind for kind in kinds if kind.any()]
+    logarithms = np.array(list(product(NODES, repeat=len(kinds))))
+    vectors = params * np.exp(logarithms @ np.array(kinds, float))
+    at_nodes = [_paraboloids(joint, vector, ~scales) for vector in vectors]
+    middle = at_nodes[len(at_nodes) // 2]
+    total = sum(middle.told, middle.prior[0])
+    random, drawn = np.random.default_rng(0), []
+    for i, parts in enumerate(joint.log_parts(vectors)[:-1]):
+        volume = [
+            np.linalg.slogdet(total - middle.told[i] + node.told[i])[1] + node.own[i]
+            for node in at_nodes
+        ]
+        weight = parts + logarithms.sum(axis=1) - 0.5 * np.array(volume)
+        weight = np.exp(weight - weight.max())
+        drawn.append(random.choice(len(weight), DRAWS, p=weight / weight.sum()))
+    return [
+        middle._replace(
+            told=[at_nodes[k].told[i] for i, k in enumerate(nodes)],
+            pulls=[at_nodes[k].pulls[i] for i, k in enumerate(nodes)],
+            excess=[at_nodes[k].excess[i] for i, k in enumerate(nodes)],
+        )
+        for nodes in np.transpose(drawn)
+    ]
+
+
+def _paraboloids(joint: JointPosterior, params: Floats, free: Flags) -> "_Paraboloids":
+    """The approximations at some parameters, of which those that are `free` are eliminated."""
+    p, curvature, slope = (
+        joint.n_shared, joint.prior_curvature(params), joint.prior_gradient(params)
+    )  # fmt: skip
+    scale = 1.0 / np.array([parameter.prior.std() for parameter in joint.parameters[:p]])
+    told, pulls, excess, volumes = [], [], [], []
+    for name, part, (gradient, fisher) in zip(
+        joint.frames, joint.parts, joint.derivatives(params), strict=True
+    ):
+        places, columns = part.places[free[part.own]], part.own[free[part.own]]
+        through = part.matrix.T @ fisher
+        own = fisher[np.ix_(places, places)] + np.diag(curvature[columns])
+        gain = through[:, places] @ inverse(own)
+        shared = through @ part.matrix - gain @ through[:, places].T
+        score = part.matrix.T @ gradient - gain @ (gradient[places] + slope[columns])
+        told.append(0.5 * (shared + shared.T) / np.outer(scale, scale))
+        pulls.append(score / scale + told[-1] @ (params[:p] * scale))
+        excess.append(_psf_excess(joint, name, told[-1], scale))
+        volumes.append(float(np.linalg.slogdet(own)[1]))
+    prior = np.diag(curvature[:p]) / np.outer(scale, scale)
+    pull = slope[:p] / scale + prior @ (params[:p] * scale)
+    return _Paraboloids(told, pulls, excess, (prior, pull), volumes)
 
 
 def _psf_excess(joint: JointPosterior, name: str, told: Floats, scale: Floats) -> Floats | None:
@@ -153,7 +208,7 @@ def _psf_excess(joint: JointPosterior, name: str, told: Floats, scale: Floats) -
     moved = np.flatnonzero(joint.part_of(name).matrix.any(axis=1))
     back = np.linalg.pinv(joint.part_of(name).matrix[moved])
     covariance = back @ errors.covariance[np.ix_(moved, moved)] @ back.T
-    return np.asarray(told @ (covariance / np.outer(scale, scale)) @ told)
+    return np.asarray(told @ (covariance * np.outer(scale, scale)) @ told)
 
 
 class _Paraboloids(NamedTuple):
@@ -163,6 +218,7 @@ class _Paraboloids(NamedTuple):
     pulls: list[Floats]  # b_i
     excess: list[Floats | None]  # G_i
     prior: tuple[Floats, Floats]  # its S and b
+    own: list[float]  # logarithms of the determinants of what is eliminated
 
     def chance(self, i: int, inside: Sequence[int]) -> float:
         """The probability of frame i's score among the frames `inside`; nan if it tells nothing."""

@@ -1,0 +1,66 @@
+"""Frames of few sources whose positions scatter: what a poorly known scale leaves of agreement."""
+
+import numpy as np
+import pytest
+
+import bayesfred as bf
+from bayesfred.analysis import frame_agreement as agreement
+from bayesfred.analysis.frame_agreement import frame_agreement
+
+SHARED = [(2, 0, 0, 0), (1, 1, 0, 0), (0, 2, 0, 0)]
+LENS = bf.PolynomialDistortion([(1, 0, 0, 0), *SHARED], [(0, 1, 0, 0), *SHARED])
+SCATTER = 0.08  # pixels, as much as seven times what the counts leave open
+
+
+def frame(seed: int, sources: int = 8, tilt: float = 0.0) -> bf.Posterior:
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-40.0, 40.0, (2, sources))
+    off = SCATTER * rng.standard_normal((2, sources)) / np.sqrt(rng.chisquare(3, sources) / 3.0)
+    flux = np.full(sources, 2e4)
+    model = bf.ForwardModel(
+        bf.Detector((101, 101)), bf.SourceCatalog(x, y, flux), bf.GaussianPSF(1.5), LENS
+    )
+    true = bf.ForwardModel(
+        model.detector, bf.SourceCatalog(x + off[0], y + off[1], flux), model.psf, LENS
+    )
+    theta = np.zeros(LENS.n_terms)
+    theta[LENS.names.index("f_x2")] = tilt
+    return bf.Posterior(
+        model,
+        bf.simulate(true, theta, 10.0, seed=seed + 9000),
+        nuisances=bf.Nuisances(flux="free", offset=True, position_scatter=True),
+    )
+
+
+def together(seed: int, *tilts: float, sources: int = 8) -> bf.JointPosterior:
+    frames = {f"f{k}": frame(seed + k, sources, tilt) for k, tilt in enumerate(tilts)}
+    return bf.JointPosterior(frames)
+
+
+def as_if_known(joint: bf.JointPosterior, params: np.ndarray) -> np.ndarray:
+    """The probabilities at the most likely scales."""
+    scales = np.array([name.endswith(agreement.SCALES) for name in joint.parameter_names])
+    return agreement._agreement(joint, [agreement._paraboloids(joint, params, ~scales)]).p
+
+
+def test_another_lens_is_found_where_positions_scatter() -> None:
+    joint = together(1, 0.0, 0.0, 1e-3, 0.0, sources=24)  # by 1.6 pixels at the edge
+    assert frame_agreement(joint, bf.find_map(joint).params).odd == ("f2",)
+
+
+@pytest.mark.statistics
+def test_a_scale_that_few_sources_tell_raises_few_alarms(record_property: pytest.FixtureRequest):
+    """Of 100 sets of three frames of 8 sources each; 1 alarm is expected, 5 have p = 0.004.
+
+    The control: the most likely scales, as if known.
+    """
+    alarms = known = 0
+    for i in range(100):
+        joint = together(100 * i, 0.0, 0.0, 0.0)
+        params = bf.find_map(joint).params
+        alarms += not frame_agreement(joint, params).agree
+        known += as_if_known(joint, params).min() < agreement.CHANCE / 3
+    record_property("alarms, of 100", alarms)
+    record_property("with known scales", known)
+    assert alarms <= 4
+    assert known > 4
