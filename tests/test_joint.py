@@ -15,6 +15,7 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.frame_agreement import frame_agreement
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
+from bayesfred.sampling.ensembles import adapted
 from bayesfred.sampling.frame_moves import FrameMove
 
 TERMS = bf.PolynomialDistortion([(1, 0, 0, 0), (3, 0, 0, 0)], [(0, 1, 0, 0), (0, 3, 0, 0)])
@@ -206,6 +207,7 @@ class Banana:
             for i in range(1, k + 1)
         )
         self.support = np.full(k + 1, -np.inf), np.full(k + 1, np.inf)
+        self.parameter_names = ("phi", *(f"f{i}.nu" for i in range(1, k + 1)))
 
     def log_parts(self, x: Floats, wanted: Flags | None = None) -> Floats:
         own = stats.gumbel_r.logpdf(x[:, 1:] - x[:, :1]).T
@@ -214,13 +216,48 @@ class Banana:
         return np.concatenate([own, stats.logistic.logpdf(x[:, :1]).T])
 
 
+class Funnel:
+    """The same with scales: tau_i has a Gamma distribution, nu_i - phi is tau_i times a normal."""
+
+    hyperparameters: ClassVar[tuple[str, ...]] = ()
+    psf_errors = None
+
+    def __init__(self, k: int) -> None:
+        from bayesfred.model.shared_parameters import Part
+
+        self.n_shared, self.n_parameters, self.k = 1, 1 + 2 * k, k
+        matrix = np.array([[1.0], [0.0], [0.0]])
+        self.parts = tuple(
+            Part(np.array([0, i, i + 1]), np.array([i, i + 1]), np.array([1, 2]), matrix)
+            for i in range(1, 1 + 2 * k, 2)
+        )
+        own = (f"f{i}.{name}" for i in range(k) for name in ("nu", "position_scatter"))
+        self.parameter_names = ("phi", *own)
+        self.support = np.full(1 + 2 * k, -np.inf), np.full(1 + 2 * k, np.inf)
+
+    def log_parts(self, x: Floats, wanted: Flags | None = None) -> Floats:
+        nu, tau = x[:, 1::2], x[:, 2::2]
+        own = (stats.gamma.logpdf(tau, 3.0) + stats.norm.logpdf(nu, x[:, :1], tau)).T
+        if wanted is not None:
+            own[~wanted] = -np.inf
+        return np.concatenate([own, stats.logistic.logpdf(x[:, :1]).T])
+
+    def draws(self, n: int) -> Floats:
+        random = np.random.RandomState(5)
+        x = np.empty((n, self.n_parameters))
+        x[:, 0] = stats.logistic.rvs(size=n, random_state=random)
+        x[:, 2::2] = stats.gamma.rvs(3.0, size=(n, self.k), random_state=random)
+        x[:, 1::2] = x[:, :1] + x[:, 2::2] * random.standard_normal((n, self.k))
+        return x
+
+
 def sampled(move: FrameMove, posterior: Any, steps: int, walkers: int) -> Floats:
     """Draws after a tenth of the steps, (n, d)."""
 
     class Model:
         random = np.random.RandomState(7)
 
-    x = np.random.RandomState(3).standard_normal((walkers, posterior.n_parameters))
+    x = np.abs(np.random.RandomState(3).standard_normal((walkers, posterior.n_parameters)))
     state, kept = State(x, log_prob=posterior.log_parts(x).sum(axis=0)), []
     for step in range(steps):
         state, _ = move.propose(Model, state)
@@ -266,6 +303,53 @@ def test_frame_moves_sample_the_right_distribution(k: int, together: bool | None
         ]
         worst[kind] = np.abs(errors).max()
     assert worst[FrameMove] < 0.02 and worst[Careless] > 0.04
+
+
+class Forgetful(FrameMove):
+    """Takes the density of a scale for that of its logarithm."""
+
+    def log_parts(self, y: Floats, wanted: Flags | None) -> Floats:
+        return self.given_parts(self._values(y), wanted)
+
+    def propose(self, model: Any, state: State) -> tuple[State, Flags]:
+        found, accepted = super().propose(model, state)
+        parts = self.posterior.log_parts(found.coords)
+        return State(found.coords, log_prob=parts.sum(axis=0)), accepted
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_scales_of_frames_have_the_right_distribution(*, fitted: bool) -> None:
+    """Quantiles of phi, tau_i and (nu_i - phi) / tau_i, to 0.02 with some 4,000 effective draws."""
+    posterior: Any = Funnel(2)
+    y = posterior.draws(4000)
+    y[:, 2::2] = np.log(y[:, 2::2])
+    worst = {}
+    for kind in (FrameMove, Forgetful):
+        given = (y,) if fitted else ()
+        move = kind(posterior, y.mean(axis=0), np.cov(y.T), posterior.log_parts, *given)
+        assert len(move.own[0].residual.weights) == (4 if fitted else 1)
+        draws = sampled(move, posterior, 600, 64)
+        tau = draws[:, 2::2]
+        errors = [
+            np.mean(values < family.ppf(q)) - q
+            for values, family in (
+                (draws[:, 0], stats.logistic),
+                *((own, stats.gamma(3.0)) for own in tau.T),
+                *((own, stats.norm()) for own in ((draws[:, 1::2] - draws[:, :1]) / tau).T),
+            )
+            for q in (0.1, 0.5, 0.9)
+        ]
+        worst[kind] = np.abs(errors).max()
+    assert worst[FrameMove] < 0.02 and worst[Forgetful] > 0.1
+
+
+def test_proposals_are_adapted_to_the_frame_that_moves_least() -> None:
+    random = np.random.default_rng(1)
+    chain = random.standard_normal((2, 40, 8, 3))
+    assert adapted(chain) == 0
+    stuck = np.repeat(chain[:, ::8, :, 2], 8, axis=1)
+    chain[..., 2] = stuck
+    assert adapted(chain) == 32
 
 
 def test_nearly_normal_frames_are_drawn_together(

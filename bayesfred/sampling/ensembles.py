@@ -212,10 +212,11 @@ def adapted(chain: Floats) -> int:
 def _accepted(chain: Floats, look: int) -> float:
     """Share of accepted moves in the latter half of the steps before a look.
 
-    Every move that is accepted changes the first parameter; of several frames it is a shared one.
+    Every move that is accepted changes all parameters; of several frames it is that of the shared
+    ones or of a frame's own, the least of which counts.
     """
-    moved = np.diff(chain[:, look // 2 : look, :, 0], axis=1) != 0.0
-    return float(moved.mean())
+    moved = np.diff(chain[:, look // 2 : look], axis=1) != 0.0
+    return float(moved.mean(axis=(0, 1, 2)).min())
 
 
 def moves_after(

@@ -11,6 +11,9 @@ I the information. A step has two moves.
    residual r_i = nu_i - B_i (phi - m) stays, which moves nu_i along. One decision for all.
 2. In those others nu_i is drawn again given phi, and each frame decides for itself.
 
+Scales, such as the scatter of a frame's positions, stand for their logarithms throughout: those of
+few sources are known to a factor, so that a normal distribution of their values is none of theirs.
+
 Proposals for k frames at once are accepted by the sum of k log-ratios of posterior and proposal. If
 frame i's has the variance s_i^2, that of the sum is s^2 = sum s_i^2, and the draws' autocorrelation
 time is E[(2 - a) / a], a the share that is accepted from where a walker stands (`_correlation`). A
@@ -33,10 +36,13 @@ from scipy.special import ndtr
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.joint import JointPosterior
+from bayesfred.model.parameters import SCALES
 from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
 
 PROBES = (3, 8)  # shared parameters, and own ones for each, that show how normal frames are
+LARGEST = 300.0  # logarithm of a scale
+PARTS = 4  # of the draws, by a frame's first scale
 KEPT = 4096  # parameter vectors whose log-densities are kept, those of all walkers among them
 
 Parts = Callable[[Floats, Flags | None], Floats]
@@ -57,18 +63,23 @@ class FrameMove(Move):  # type: ignore[misc]
     posterior : JointPosterior
     mean : ndarray, shape (d,)
     covariance : ndarray, shape (d, d)
-        Those of the proposals; the frames' own parameters are taken as independent given the
-        shared ones.
+        Those of the proposals, scales by their logarithms; the frames' own parameters are taken as
+        independent given the shared ones.
     log_parts : callable
         As `JointPosterior.log_parts`.
+    draws : ndarray, shape (n, d), optional
+        Of the posterior: a scale sets how far what it is a scale of spreads, so that a frame's own
+        parameters then have a proposal for each quarter of its draws.
     """
 
     def __init__(
-        self, posterior: JointPosterior, mean: Floats, covariance: Floats, log_parts: Parts
-    ) -> None:
+        self, posterior: JointPosterior, mean: Floats, covariance: Floats, log_parts: Parts,
+        draws: Floats | None = None,
+    ) -> None:  # fmt: skip
         p = posterior.n_shared
         low, high = posterior.support
-        self.posterior, self.log_parts = posterior, log_parts
+        self.posterior, self.given_parts = posterior, log_parts
+        self.scales = _scales(posterior)
         self.centre = mean[:p]
         block = covariance[:p, :p]
         self.shared = LaplaceMove(mean[:p], block, support=(low[:p], high[:p]))
@@ -78,7 +89,13 @@ class FrameMove(Move):  # type: ignore[misc]
             cross = covariance[part.own, :p]
             slopes = cross @ known
             given = covariance[np.ix_(part.own, part.own)] - slopes @ cross.T
-            residual = LaplaceMove(mean[part.own], 0.5 * (given + given.T), heavy_share=0.0)
+            approximation = mean[part.own], 0.5 * (given + given.T)
+            scales = np.flatnonzero(self.scales[part.own])
+            if draws is not None and scales.size and len(draws) > 2 * PARTS * part.own.size:
+                residuals = draws[:, part.own] - (draws[:, :p] - self.centre) @ slopes.T
+                approximation = _by_scale(residuals, scales[0])
+            shares = np.full(approximation[0].size // part.own.size, 1.0)
+            residual = LaplaceMove(*approximation, shares / shares.size, heavy_share=0.0)
             self.own.append(_Own(slopes, residual))
         self.kept: dict[bytes, Floats] = {}
         self.together = self._together()
@@ -94,12 +111,30 @@ class FrameMove(Move):  # type: ignore[misc]
         mean, (low, high) = estimate.params, posterior.support
         if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
             mean = mean + covariance @ posterior.gradient(mean)
-        return cls(posterior, mean, covariance, log_parts)
+        scales = _scales(posterior)
+        typical = np.maximum(mean, np.sqrt(np.diag(covariance)))[scales]
+        mean, unit = mean.copy(), np.ones(mean.size)
+        mean[scales], unit[scales] = np.log(typical), typical
+        return cls(posterior, mean, covariance / np.outer(unit, unit), log_parts)
 
     @classmethod
     def fitted(cls, posterior: JointPosterior, draws: Floats, log_parts: Parts) -> "FrameMove":
         """The move with the mean and covariance of draws, shape (n, d)."""
-        return cls(posterior, draws.mean(axis=0), np.cov(draws.T, ddof=0), log_parts)
+        y = _logarithms(draws, _scales(posterior))
+        return cls(posterior, y.mean(axis=0), np.cov(y.T, ddof=0), log_parts, y)
+
+    def log_parts(self, y: Floats, wanted: Flags | None) -> Floats:
+        """The log-densities of vectors with the logarithms of scales, of these, in parts."""
+        out = self.given_parts(self._values(y), wanted)
+        for i, part in enumerate(self.posterior.parts):
+            out[i] += y[:, part.own[self.scales[part.own]]].sum(axis=1)
+        return out
+
+    def _values(self, y: Floats) -> Floats:
+        """The parameters themselves."""
+        x = y.copy()
+        x[:, self.scales] = np.exp(np.minimum(y[:, self.scales], LARGEST))
+        return x
 
     def _drawn(self, x: Floats, random: np.random.RandomState) -> tuple[Floats, Floats]:
         """Vectors whose shared parameters are new, and log q(old) - log q(new) of these.
@@ -148,9 +183,9 @@ class FrameMove(Move):  # type: ignore[misc]
 
     def propose(self, model: Any, state: State) -> tuple[State, Flags]:
         """New positions for all walkers, and which have new shared parameters."""
-        random, x = model.random, state.coords
-        n = len(x)
-        parts = self._parts_at(x)
+        random, before = model.random, state.coords
+        n, x = len(before), _logarithms(before, self.scales)
+        x_before, parts = x, self._parts_at(before)
         new, factor = self._drawn(x, random)
         for i in np.flatnonzero(self.together).tolist():
             factor += self._redraw(i, new, random)
@@ -173,18 +208,43 @@ class FrameMove(Move):  # type: ignore[misc]
                 parts[i, taken] = there[i, taken]
         if len(self.kept) > KEPT:
             self.kept.clear()
-        for vector, column in zip(x, parts.T, strict=True):
+        log_prob = parts.sum(axis=0) - x[:, self.scales].sum(axis=1)
+        found = np.where(x == x_before, before, self._values(x))  # what stays, to the last bit
+        for vector, column in zip(found, parts.T, strict=True):
             self.kept[vector.tobytes()] = column
-        return State(x, log_prob=parts.sum(axis=0), random_state=state.random_state), accepted
+        return State(found, log_prob=log_prob, random_state=state.random_state), accepted
 
     def _parts_at(self, x: Floats) -> Floats:
         """The log-densities at the walkers' positions, as far as they are known from before."""
         out = [self.kept.get(vector.tobytes()) for vector in x]
         missing = [k for k, known in enumerate(out) if known is None]
         if missing:
-            for k, column in zip(missing, self.log_parts(x[missing], None).T, strict=True):
+            y = _logarithms(x[missing], self.scales)
+            for k, column in zip(missing, self.log_parts(y, None).T, strict=True):
                 out[k] = column
         return np.array(out).T
+
+
+def _scales(posterior: JointPosterior) -> Flags:
+    """Which parameters are scales of single frames, shape (d,)."""
+    scales = [name.rsplit(".", 1)[-1] in SCALES for name in posterior.parameter_names]
+    return np.array(scales) & (np.arange(len(scales)) >= posterior.n_shared)
+
+
+def _by_scale(draws: Floats, scale: int) -> tuple[Floats, Floats]:
+    """Means and covariances of draws in parts of equal number, by a column."""
+    parts = np.array_split(draws[np.argsort(draws[:, scale], kind="stable")], PARTS)
+    return np.stack([part.mean(axis=0) for part in parts]), np.stack(
+        [np.cov(part.T, ddof=0) for part in parts]
+    )
+
+
+def _logarithms(x: Floats, scales: Flags) -> Floats:
+    """Parameter vectors with the logarithms of scales."""
+    y = x.copy()
+    with np.errstate(divide="ignore"):
+        y[:, scales] = np.log(x[:, scales])
+    return y
 
 
 def _correlation(s: float) -> float:
