@@ -9,7 +9,7 @@ import planted
 import pytest
 from scipy import stats
 
-from bayesfred.analysis.causes import Cause, find_causes
+from bayesfred.analysis.causes import Cause, find_causes, light
 from bayesfred.analysis.causes.cause import Finding, psf_remedy, scatter_remedy
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.find import ranked
@@ -75,6 +75,29 @@ def test_a_wrong_psf_is_not_called_companions(name: str, record_property: Any) -
     false = sum("companions" in names for names in named)
     record_property("companions named, of 50", false)
     assert false <= 0.04 * FRAMES
+
+
+def test_outermost_sources_show_missing_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two or three hold most of the misfit of these frames, and would be called wrong sources."""
+    frames = [planted.fisheye(seed) for seed in (3, 5, 7)]
+    assert [judged(frame).causes[0].name for frame in frames] == 3 * ["missing terms"]
+    monkeypatch.setattr(light, "_outermost", lambda *given: False)
+    assert [judged(frame).causes[0].name for frame in frames] == 3 * ["wrong sources"]
+
+
+def test_what_is_typical_is_that_of_the_sources_nearby() -> None:
+    """Where a PSF is wrong all hold more than elsewhere; one that does so alone is not typical."""
+    posterior = planted.true(1)
+    context = Context(posterior, find_map(posterior).params, np.zeros(planted.SHAPE, bool))
+    far = context.light.position[:, 0] > 25.0
+    assert 12 < far.sum() < 20
+    each = np.where(far, 0.5, 0.1)
+    alone = int(np.argmin(context.light.position[:, 0]))
+    each[alone] = 3.0
+    vars(context)["source_excess"] = each * context.power
+    assert context.typical[alone] == pytest.approx(0.1)
+    assert context.typical[np.argmax(context.light.position[:, 0])] == pytest.approx(0.5)
+    assert context.typical.min() == pytest.approx(0.1)
 
 
 def test_leaving_out_outliers_cures_companions() -> None:

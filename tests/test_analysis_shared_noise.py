@@ -60,6 +60,15 @@ def test_errors_are_those_of_positions_in_such_noise(share: float) -> None:
     assert without < 0.97 * scatter_of_positions(z)
 
 
+def test_an_uneven_background_is_no_part_of_a_correlation() -> None:
+    """A wave of the sky of a quarter of the noise would add 0.015, ten times the error."""
+    z = smoothed(noise(9, (600, 700)))
+    wave = 0.25 * np.sin(np.arange(700) / 40.0)
+    found = shared_noise(z + wave, everywhere(z), WIDTH)
+    assert found is not None
+    assert found.along == pytest.approx([0.5, 0.5], abs=0.007)
+
+
 def test_a_sharpened_frame_has_errors_that_are_smaller() -> None:
     z = noise(2)
     z = z - 0.6 * ndimage.uniform_filter(z, 3, mode="wrap")

@@ -260,7 +260,10 @@ def sampled(move: FrameMove, posterior: Any, steps: int, walkers: int) -> Floats
     x = np.abs(np.random.RandomState(3).standard_normal((walkers, posterior.n_parameters)))
     state, kept = State(x, log_prob=posterior.log_parts(x).sum(axis=0)), []
     for step in range(steps):
+        before = state.coords
         state, _ = move.propose(Model, state)
+        near = np.isclose(state.coords, before, rtol=1e-13, atol=0.0)
+        assert np.array_equal(state.coords[near], before[near])  # what stays, to the last bit
         np.testing.assert_allclose(state.log_prob, posterior.log_parts(state.coords).sum(axis=0))
         if step >= steps // 10:
             kept.append(state.coords)

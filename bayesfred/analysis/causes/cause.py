@@ -6,7 +6,6 @@ from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.measure_psf import varying_more
 
 RICHER = 0.9  # weight of a hypothesis that contains others
-BY_CHANCE = 1e-4  # that few sources are so bright or so far out among the others
 MISSING = "missing terms"
 
 

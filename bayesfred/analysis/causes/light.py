@@ -13,7 +13,6 @@ from scipy import ndimage, stats
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.causes.cause import (
-    BY_CHANCE,
     MISSING,
     RICHER,
     Cause,
@@ -28,6 +27,7 @@ FEW = 0.2  # of the sources: more than these are not the ones to blame
 OUTLYING = 6.0  # times the typical misfit of a source as bright
 NOTICEABLE = 6.0  # standard deviations
 NAMED = 5  # sources listed
+RIM = 0.01  # chance that sources lie as far out, where terms are known to be missing
 RICHEST = 0.7  # weight of companions, which near enough are displacements, too, and other PSFs
 REJECT = "set frame.reject_outliers = true"
 ORDERS = range(5)  # of the pattern that is no companion, coma and trefoil included
@@ -115,7 +115,7 @@ def _outermost(context: Context, some: Flags) -> bool:
     radius = np.hypot(*(position - np.mean(position[inside], axis=0)).T)
     others = inside & ~some
     test = stats.mannwhitneyu(radius[some], radius[others], alternative="greater")
-    return bool(test.pvalue < BY_CHANCE)
+    return bool(test.pvalue < RIM)
 
 
 def psf(context: Context) -> Finding | None:

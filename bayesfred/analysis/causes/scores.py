@@ -15,7 +15,6 @@ from scipy import stats
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.causes.cause import (
-    BY_CHANCE,
     MISSING,
     RICHER,
     Cause,
@@ -32,6 +31,7 @@ from bayesfred.imaging.monomials import degree_of
 from bayesfred.model.posterior import Posterior
 
 NOISE = 2.0  # standard deviations by which a spread has to explain more than chance
+BY_CHANCE = 1e-4  # that so many of the brightest are among few sources
 MORE_TERMS = (MISSING, "")
 # The cause, and what frees a number that a score test finds wrong, by the beginning of its name.
 REMEDIES = {
