@@ -39,8 +39,7 @@ def together(seed: int, *tilts: float, sources: int = 8) -> bf.JointPosterior:
 
 def as_if_known(joint: bf.JointPosterior, params: np.ndarray) -> np.ndarray:
     """The probabilities at the most likely scales."""
-    scales = np.array([name.endswith(agreement.SCALES) for name in joint.parameter_names])
-    return agreement._agreement(joint, [agreement._paraboloids(joint, params, ~scales)]).p
+    return agreement._agreement(joint, [agreement._paraboloids(joint, params, ~joint.scales)]).p
 
 
 def test_another_lens_is_found_where_positions_scatter() -> None:

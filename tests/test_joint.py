@@ -207,7 +207,7 @@ class Banana:
             for i in range(1, k + 1)
         )
         self.support = np.full(k + 1, -np.inf), np.full(k + 1, np.inf)
-        self.parameter_names = ("phi", *(f"f{i}.nu" for i in range(1, k + 1)))
+        self.scales = np.zeros(k + 1, bool)
 
     def log_parts(self, x: Floats, wanted: Flags | None = None) -> Floats:
         own = stats.gumbel_r.logpdf(x[:, 1:] - x[:, :1]).T
@@ -231,8 +231,8 @@ class Funnel:
             Part(np.array([0, i, i + 1]), np.array([i, i + 1]), np.array([1, 2]), matrix)
             for i in range(1, 1 + 2 * k, 2)
         )
-        own = (f"f{i}.{name}" for i in range(k) for name in ("nu", "position_scatter"))
-        self.parameter_names = ("phi", *own)
+        self.scales = np.arange(1 + 2 * k) % 2 == 0
+        self.scales[0] = False
         self.support = np.full(1 + 2 * k, -np.inf), np.full(1 + 2 * k, np.inf)
 
     def log_parts(self, x: Floats, wanted: Flags | None = None) -> Floats:

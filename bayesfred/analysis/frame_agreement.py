@@ -35,6 +35,7 @@ from scipy import linalg, stats
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.joint import JointPosterior
+from bayesfred.model.parameters import SCALES
 from bayesfred.optimize.estimate import inverse
 
 __all__ = ["FrameAgreement", "frame_agreement"]
@@ -42,7 +43,6 @@ __all__ = ["FrameAgreement", "frame_agreement"]
 CHANCE = 0.01  # probability that frames of one instrument are said to disagree
 TOLD = 1e-3  # share of what is known of a direction that the frame, and the others, tell at least
 MOST_NAMED = 5
-SCALES = ("position_scatter", "model_error")
 NODES = np.linspace(-1.6, 1.6, 5)  # of the grid, about a scale's logarithm
 DRAWS = 64
 
@@ -120,7 +120,7 @@ def frame_agreement(joint: JointPosterior, params: Floats) -> FrameAgreement:
     >>> frame_agreement(joint, bf.find_map(joint).params).odd
     ('c',)
     """
-    scales = np.array([name.endswith(SCALES) for name in joint.parameter_names])
+    scales = joint.scales
     agreement = _agreement(joint, [_paraboloids(joint, params, ~scales)])
     if agreement.agree or not scales.any():
         return agreement
@@ -149,7 +149,10 @@ def _agreement(joint: JointPosterior, several: "Sequence[_Paraboloids]") -> Fram
 
 def _of_scales(joint: JointPosterior, params: Floats, scales: Flags) -> "list[_Paraboloids]":
     """Approximations whose scales are drawn, frame by frame, from their posterior on a grid."""
-    kinds = [np.array([n.endswith(kind) for n in joint.parameter_names]) for kind in SCALES]
+    kinds = [
+        scales & np.array([name.endswith(kind) for name in joint.parameter_names])
+        for kind in SCALES
+    ]
     kinds = [kind for kind in kinds if kind.any()]
     logarithms = np.array(list(product(NODES, repeat=len(kinds))))
     vectors = params * np.exp(logarithms @ np.array(kinds, float))
@@ -180,7 +183,6 @@ def _paraboloids(joint: JointPosterior, params: Floats, free: Flags) -> "_Parabo
     p, curvature, slope = (
         joint.n_shared, joint.prior_curvature(params), joint.prior_gradient(params)
     )  # fmt: skip
-    scale = 1.0 / np.array([parameter.prior.std() for parameter in joint.parameters[:p]])
     told, pulls, excess, volumes = [], [], [], []
     for name, part, (gradient, fisher) in zip(
         joint.frames, joint.parts, joint.derivatives(params), strict=True
@@ -188,19 +190,19 @@ def _paraboloids(joint: JointPosterior, params: Floats, free: Flags) -> "_Parabo
         places, columns = part.places[free[part.own]], part.own[free[part.own]]
         through = part.matrix.T @ fisher
         own = fisher[np.ix_(places, places)] + np.diag(curvature[columns])
-        gain = through[:, places] @ inverse(own)
+        gain = through[:, places] @ inverse(own) if places.size else through[:, places]
         shared = through @ part.matrix - gain @ through[:, places].T
         score = part.matrix.T @ gradient - gain @ (gradient[places] + slope[columns])
-        told.append(0.5 * (shared + shared.T) / np.outer(scale, scale))
-        pulls.append(score / scale + told[-1] @ (params[:p] * scale))
-        excess.append(_psf_excess(joint, name, told[-1], scale))
+        told.append(0.5 * (shared + shared.T))
+        pulls.append(score + told[-1] @ params[:p])
+        excess.append(_psf_excess(joint, name, told[-1]))
         volumes.append(float(np.linalg.slogdet(own)[1]))
-    prior = np.diag(curvature[:p]) / np.outer(scale, scale)
-    pull = slope[:p] / scale + prior @ (params[:p] * scale)
+    prior = np.diag(curvature[:p])
+    pull = slope[:p] + prior @ params[:p]
     return _Paraboloids(told, pulls, excess, (prior, pull), volumes)
 
 
-def _psf_excess(joint: JointPosterior, name: str, told: Floats, scale: Floats) -> Floats | None:
+def _psf_excess(joint: JointPosterior, name: str, told: Floats) -> Floats | None:
     """What the errors of a frame's PSF add to the covariance of its score."""
     errors = joint.frames[name].psf_errors
     if errors is None:
@@ -208,11 +210,11 @@ def _psf_excess(joint: JointPosterior, name: str, told: Floats, scale: Floats) -
     moved = np.flatnonzero(joint.part_of(name).matrix.any(axis=1))
     back = np.linalg.pinv(joint.part_of(name).matrix[moved])
     covariance = back @ errors.covariance[np.ix_(moved, moved)] @ back.T
-    return np.asarray(told @ (covariance * np.outer(scale, scale)) @ told)
+    return np.asarray(told @ covariance @ told)
 
 
 class _Paraboloids(NamedTuple):
-    """The log-likelihoods of all frames, and the prior, about what is shared, in scaled units."""
+    """The log-likelihoods of all frames, and the prior, about what is shared."""
 
     told: list[Floats]  # S_i
     pulls: list[Floats]  # b_i
@@ -223,8 +225,11 @@ class _Paraboloids(NamedTuple):
     def chance(self, i: int, inside: Sequence[int]) -> float:
         """The probability of frame i's score among the frames `inside`; nan if it tells nothing."""
         total = sum((self.told[j] for j in inside), self.prior[0])
-        covariance, told = linalg.inv(total), self.told[i]
-        maximum = covariance @ sum((self.pulls[j] for j in inside), self.prior[1])
+        unit = 1.0 / np.sqrt(np.diag(total))  # of what is shared
+        units = np.outer(unit, unit)
+        total, told = total * units, self.told[i] * units
+        covariance = linalg.inv(total)
+        maximum = covariance @ (unit * sum((self.pulls[j] for j in inside), self.prior[1]))
         # the directions in which this frame knows the share a of what is known
         share, axes = linalg.eigh(told, total)
         usable = (share > TOLD) & (share < 1.0 - TOLD)
@@ -236,8 +241,8 @@ class _Paraboloids(NamedTuple):
             more = self.excess[j]
             if more is not None:
                 change = float(i == j) * np.eye(len(told)) - through
-                spread = spread + change @ more @ change.T
+                spread = spread + change @ (more * units) @ change.T
         lower = linalg.cholesky(axes.T @ spread @ axes, lower=True)
-        score = axes.T @ (self.pulls[i] - told @ maximum)
+        score = axes.T @ (unit * self.pulls[i] - told @ maximum)
         chi2 = float(np.sum(linalg.solve_triangular(lower, score, lower=True) ** 2))
         return float(stats.chi2.sf(chi2, usable.sum()))

@@ -25,7 +25,7 @@ from bayesfred.model import priors
 from bayesfred.model.drift import Drift, DriftColumn
 from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.frame_evaluator import FrameEvaluator, LocalFrames
-from bayesfred.model.parameters import Parameter
+from bayesfred.model.parameters import SCALES, Parameter
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.model.shared_parameters import (
@@ -132,6 +132,12 @@ class JointPosterior(FrameDensity):
     def n_shared(self) -> int:
         """Number of parameters that no frame has to itself: the shared ones and their drift."""
         return len(self.shared) + len(self._drifts)
+
+    @cached_property
+    def scales(self) -> Flags:
+        """Which parameters are scales of single frames, such as their model errors; shape (d,)."""
+        scales = np.array([name.endswith(SCALES) for name in self.parameter_names])
+        return scales & (np.arange(scales.size) >= self.n_shared)
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:

@@ -36,7 +36,6 @@ from scipy.special import ndtr
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.model.joint import JointPosterior
-from bayesfred.model.parameters import SCALES
 from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
 
@@ -79,7 +78,7 @@ class FrameMove(Move):  # type: ignore[misc]
         p = posterior.n_shared
         low, high = posterior.support
         self.posterior, self.given_parts = posterior, log_parts
-        self.scales = _scales(posterior)
+        self.scales = posterior.scales
         self.centre = mean[:p]
         block = covariance[:p, :p]
         self.shared = LaplaceMove(mean[:p], block, support=(low[:p], high[:p]))
@@ -111,7 +110,7 @@ class FrameMove(Move):  # type: ignore[misc]
         mean, (low, high) = estimate.params, posterior.support
         if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
             mean = mean + covariance @ posterior.gradient(mean)
-        scales = _scales(posterior)
+        scales = posterior.scales
         typical = np.maximum(mean, np.sqrt(np.diag(covariance)))[scales]
         mean, unit = mean.copy(), np.ones(mean.size)
         mean[scales], unit[scales] = np.log(typical), typical
@@ -120,7 +119,7 @@ class FrameMove(Move):  # type: ignore[misc]
     @classmethod
     def fitted(cls, posterior: JointPosterior, draws: Floats, log_parts: Parts) -> "FrameMove":
         """The move with the mean and covariance of draws, shape (n, d)."""
-        y = _logarithms(draws, _scales(posterior))
+        y = _logarithms(draws, posterior.scales)
         return cls(posterior, y.mean(axis=0), np.cov(y.T, ddof=0), log_parts, y)
 
     def log_parts(self, y: Floats, wanted: Flags | None) -> Floats:
@@ -223,12 +222,6 @@ class FrameMove(Move):  # type: ignore[misc]
             for k, column in zip(missing, self.log_parts(y, None).T, strict=True):
                 out[k] = column
         return np.array(out).T
-
-
-def _scales(posterior: JointPosterior) -> Flags:
-    """Which parameters are scales of single frames, shape (d,)."""
-    scales = [name.rsplit(".", 1)[-1] in SCALES for name in posterior.parameter_names]
-    return np.array(scales) & (np.arange(len(scales)) >= posterior.n_shared)
 
 
 def _by_scale(draws: Floats, scale: int) -> tuple[Floats, Floats]:
