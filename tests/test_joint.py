@@ -11,7 +11,7 @@ from emcee import State
 from scipy import stats
 
 import bayesfred as bf
-from bayesfred._typing import Flags, Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.frame_agreement import frame_agreement
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
@@ -264,7 +264,7 @@ def sampled(move: FrameMove, posterior: Any, steps: int, walkers: int) -> Floats
         state, _ = move.propose(Model, state)
         near = np.isclose(state.coords, before, rtol=1e-13, atol=0.0)
         assert np.array_equal(state.coords[near], before[near])  # what stays, to the last bit
-        np.testing.assert_allclose(state.log_prob, posterior.log_parts(state.coords).sum(axis=0))
+        np.testing.assert_array_equal(state.log_prob, posterior.log_parts(state.coords).sum(axis=0))
         if step >= steps // 10:
             kept.append(state.coords)
     return np.concatenate(kept)
@@ -311,13 +311,8 @@ def test_frame_moves_sample_the_right_distribution(k: int, together: bool | None
 class Forgetful(FrameMove):
     """Takes the density of a scale for that of its logarithm."""
 
-    def log_parts(self, y: Floats, wanted: Flags | None) -> Floats:
-        return self.given_parts(self._values(y), wanted)
-
-    def propose(self, model: Any, state: State) -> tuple[State, Flags]:
-        found, accepted = super().propose(model, state)
-        parts = self.posterior.log_parts(found.coords)
-        return State(found.coords, log_prob=parts.sum(axis=0)), accepted
+    def _volume(self, y: Floats, columns: Ints | slice = slice(None)) -> Floats:
+        return 0.0 * super()._volume(y, columns)
 
 
 @pytest.mark.parametrize("fitted", [False, True])

@@ -34,7 +34,7 @@ from emcee import State
 from emcee.moves import Move
 from scipy.special import ndtr
 
-from bayesfred._typing import Flags, Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.model.joint import JointPosterior
 from bayesfred.optimize.estimate import MapEstimate, inverse
 from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
@@ -77,7 +77,7 @@ class FrameMove(Move):  # type: ignore[misc]
     ) -> None:  # fmt: skip
         p = posterior.n_shared
         low, high = posterior.support
-        self.posterior, self.given_parts = posterior, log_parts
+        self.posterior, self.log_parts = posterior, log_parts
         self.scales = posterior.scales
         self.centre = mean[:p]
         block = covariance[:p, :p]
@@ -122,18 +122,15 @@ class FrameMove(Move):  # type: ignore[misc]
         y = _logarithms(draws, posterior.scales)
         return cls(posterior, y.mean(axis=0), np.cov(y.T, ddof=0), log_parts, y)
 
-    def log_parts(self, y: Floats, wanted: Flags | None) -> Floats:
-        """The log-densities of vectors with the logarithms of scales, of these, in parts."""
-        out = self.given_parts(self._values(y), wanted)
-        for i, part in enumerate(self.posterior.parts):
-            out[i] += y[:, part.own[self.scales[part.own]]].sum(axis=1)
-        return out
-
     def _values(self, y: Floats) -> Floats:
         """The parameters themselves."""
         x = y.copy()
         x[:, self.scales] = np.exp(np.minimum(y[:, self.scales], LARGEST))
         return x
+
+    def _volume(self, y: Floats, columns: Ints | slice = slice(None)) -> Floats:
+        """Logarithm of the volume of scales over that of their logarithms."""
+        return np.asarray(y[:, columns][:, self.scales[columns]].sum(axis=1))
 
     def _drawn(self, x: Floats, random: np.random.RandomState) -> tuple[Floats, Floats]:
         """Vectors whose shared parameters are new, and log q(old) - log q(new) of these.
@@ -169,7 +166,8 @@ class FrameMove(Move):  # type: ignore[misc]
             residual = own.residual.draw(n, random)
             x[:, self.posterior.parts[i].own] = residual + self._moved(own, x)
             log_q[i] = own.residual.log_density(residual)
-        ratio = (self.log_parts(x, None)[:-1] - log_q).reshape(k, *PROBES)
+        log_q -= [self._volume(x, part.own) for part in self.posterior.parts]
+        ratio = (self.log_parts(self._values(x), None)[:-1] - log_q).reshape(k, *PROBES)
         with np.errstate(invalid="ignore"):
             variance = ratio.var(axis=2, ddof=1).mean(axis=1)
         variance = np.nan_to_num(variance, nan=np.inf)
@@ -182,44 +180,48 @@ class FrameMove(Move):  # type: ignore[misc]
 
     def propose(self, model: Any, state: State) -> tuple[State, Flags]:
         """New positions for all walkers, and which have new shared parameters."""
-        random, before = model.random, state.coords
-        n, x = len(before), _logarithms(before, self.scales)
-        x_before, parts = x, self._parts_at(before)
-        new, factor = self._drawn(x, random)
+        random, before, n = model.random, state.coords, len(state.coords)
+        y = first = _logarithms(before, self.scales)
+        parts = self._parts_at(before)
+
+        def values(y: Floats) -> Floats:
+            return np.where(y == first, before, self._values(y))  # what stays, to the last bit
+
+        new, factor = self._drawn(y, random)
         for i in np.flatnonzero(self.together).tolist():
             factor += self._redraw(i, new, random)
-        there = self.log_parts(new, None)
+        there = self.log_parts(values(new), None)
+        factor += self._volume(new) - self._volume(y)
         with np.errstate(invalid="ignore"):
             ratio = there.sum(axis=0) - parts.sum(axis=0) + factor
         accepted = np.log(random.random_sample(n)) < ratio
-        x = np.where(accepted[:, None], new, x)
+        y = np.where(accepted[:, None], new, y)
         parts = np.where(accepted, there, parts)
         if not self.together.all():
-            new, alone = x.copy(), np.flatnonzero(~self.together).tolist()
+            new, alone = y.copy(), np.flatnonzero(~self.together).tolist()
             factors = np.array([self._redraw(i, new, random) for i in alone])
-            there = self.log_parts(new, ~self.together)
+            there = self.log_parts(values(new), ~self.together)
             for i, own_factor in zip(alone, factors, strict=True):
+                columns = self.posterior.parts[i].own
+                own_factor = own_factor + self._volume(new, columns) - self._volume(y, columns)
                 with np.errstate(invalid="ignore"):
                     ratio = there[i] - parts[i] + own_factor
                 taken = np.flatnonzero(np.log(random.random_sample(n)) < ratio)
-                columns = self.posterior.parts[i].own
-                x[np.ix_(taken, columns)] = new[np.ix_(taken, columns)]
+                y[np.ix_(taken, columns)] = new[np.ix_(taken, columns)]
                 parts[i, taken] = there[i, taken]
         if len(self.kept) > KEPT:
             self.kept.clear()
-        log_prob = parts.sum(axis=0) - x[:, self.scales].sum(axis=1)
-        found = np.where(x == x_before, before, self._values(x))  # what stays, to the last bit
-        for vector, column in zip(found, parts.T, strict=True):
+        x = values(y)
+        for vector, column in zip(x, parts.T, strict=True):
             self.kept[vector.tobytes()] = column
-        return State(found, log_prob=log_prob, random_state=state.random_state), accepted
+        return State(x, log_prob=parts.sum(axis=0), random_state=state.random_state), accepted
 
     def _parts_at(self, x: Floats) -> Floats:
         """The log-densities at the walkers' positions, as far as they are known from before."""
         out = [self.kept.get(vector.tobytes()) for vector in x]
         missing = [k for k, known in enumerate(out) if known is None]
         if missing:
-            y = _logarithms(x[missing], self.scales)
-            for k, column in zip(missing, self.log_parts(y, None).T, strict=True):
+            for k, column in zip(missing, self.log_parts(x[missing], None).T, strict=True):
                 out[k] = column
         return np.array(out).T
 
