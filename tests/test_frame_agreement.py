@@ -1,5 +1,6 @@
 """Frames of few sources whose positions scatter: what a poorly known scale leaves of agreement."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import bayesfred as bf
 from bayesfred._typing import Floats
 from bayesfred.analysis import frame_agreement as agreement
 from bayesfred.analysis.frame_agreement import frame_agreement
+from bayesfred.sampling.ensembles import adapted
 
 SHARED = [(2, 0, 0, 0), (1, 1, 0, 0), (0, 2, 0, 0)]
 LENS = bf.PolynomialDistortion([(1, 0, 0, 0), *SHARED], [(0, 1, 0, 0), *SHARED])
@@ -48,6 +50,18 @@ def as_if_known(joint: bf.JointPosterior, params: Floats) -> Floats:
 def test_another_lens_is_found_where_positions_scatter() -> None:
     joint = together(1, 0.0, 0.0, 1e-3, 0.0, sources=24)  # by 1.6 pixels at the edge
     assert frame_agreement(joint, bf.find_map(joint).params).odd == ("f2",)
+
+
+def test_a_run_whose_proposals_adapt_is_resumed_bit_by_bit(tmp_path: Path) -> None:
+    """Scales go by their logarithms within a step, which must leave nothing behind."""
+    joint = together(1, 0.0, 0.0, sources=16)
+    best, path = bf.find_map(joint), tmp_path / "run.h5"
+    bf.sample(joint, best, seed=2, path=path, steps=12, progress=False)
+    resumed = bf.sample(joint, seed=2, path=path, steps=36, resume=True, progress=False)
+    straight = bf.sample(joint, best, seed=2, steps=36, progress=False)
+    assert adapted(straight.chain) > 12
+    np.testing.assert_array_equal(resumed.chain, straight.chain)
+    np.testing.assert_array_equal(resumed.log_prob, straight.log_prob)
 
 
 @pytest.mark.statistics
