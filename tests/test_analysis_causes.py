@@ -77,6 +77,7 @@ def test_a_wrong_psf_is_not_called_companions(name: str, record_property: Any) -
     assert false <= 0.04 * FRAMES
 
 
+@pytest.mark.slow
 def test_outermost_sources_show_missing_terms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two or three hold most of the misfit of these frames, and would be called wrong sources."""
     frames = [planted.fisheye(seed) for seed in (3, 5, 7)]

@@ -112,6 +112,7 @@ def test_only_pairs_of_pixels_between_sources_count() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_resampled_frame_fails_where_gain_and_read_noise_were_set_until_sums_agree() -> None:
     posterior = planted.resampled(8)
     sources = posterior.model.sources

@@ -47,11 +47,13 @@ def as_if_known(joint: bf.JointPosterior, params: Floats) -> Floats:
     return agreement._agreement(joint, [agreement._paraboloids(joint, params, ~joint.scales)]).p
 
 
+@pytest.mark.slow
 def test_another_lens_is_found_where_positions_scatter() -> None:
     joint = together(1, 0.0, 0.0, 1e-3, 0.0, sources=24)  # by 1.6 pixels at the edge
     assert frame_agreement(joint, bf.find_map(joint).params).odd == ("f2",)
 
 
+@pytest.mark.slow
 def test_a_run_whose_proposals_adapt_is_resumed_bit_by_bit(tmp_path: Path) -> None:
     """Scales go by their logarithms within a step, which must leave nothing behind."""
     joint = together(1, 0.0, 0.0, sources=16)

@@ -274,6 +274,7 @@ def test_log_prob_is_the_laplace_integral_over_fluxes_and_shifts(case: str) -> N
     assert not fisher[k, others].any()
 
 
+@pytest.mark.slow
 def test_of_two_modes_of_a_shift_the_higher_counts() -> None:
     """A source far off, as its counts tell, has one near the catalogue and one near its image.
 
