@@ -411,6 +411,7 @@ def test_a_gaussian_fitted_to_a_moffat_is_noticed() -> None:
 # Files
 
 
+@pytest.mark.slow
 def test_chain_files_hold_any_psf(psf: PSF, tmp_path: Path) -> None:
     posterior, _ = make_posterior(psf, *CASES["scale"], 89)
     chain = run(posterior, find_map(posterior), tmp_path / "chain.h5", steps=4, walkers=32)

@@ -414,7 +414,11 @@ def two_threads() -> Any:
     nb.set_num_threads(before)
 
 
-@pytest.mark.parametrize("nuisances", [EVERYTHING, Nuisances("free")], ids=["scale", "free"])
+@pytest.mark.parametrize(
+    "nuisances",
+    [EVERYTHING, pytest.param(Nuisances("free"), marks=pytest.mark.slow)],
+    ids=["scale", "free"],
+)
 def test_log_prob_of_a_batch_has_the_same_bits_for_any_threads(
     two_threads: Any, nuisances: Nuisances
 ) -> None:
