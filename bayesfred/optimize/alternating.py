@@ -38,10 +38,10 @@ def alternating_message(counts: Floats, valid: Flags) -> str:
     >>> alternating_message(counts, counts >= 0.0)[:37]
     'even and odd rows and columns differ:'
     """
-    ny, nx = (min(n, MOST) // 2 * 2 for n in counts.shape)
-    j, i = ((n - m) // 4 * 2 for n, m in zip(counts.shape, (ny, nx), strict=True))
-    middle = slice(j, j + ny), slice(i, i + nx)
-    squares = np.where(valid[middle], counts[middle], np.nan).reshape(ny // 2, 2, nx // 2, 2)
+    middle = middle_of(counts.shape)
+    kept = np.where(valid[middle], counts[middle], np.nan)
+    ny, nx = kept.shape
+    squares = kept.reshape(ny // 2, 2, nx // 2, 2)
     kinds = squares.transpose(1, 3, 0, 2).reshape(4, -1)
     kinds = kinds[:, np.isfinite(kinds).all(axis=0)]
     if kinds.shape[1] < FEWEST:
@@ -55,3 +55,10 @@ def alternating_message(counts: Floats, valid: Flags) -> str:
         "odd ones; of a colour camera take the pixels of one colour, or set frame.flat to the "
         "relative response of every pixel; if amplifiers add constants, subtract a dark frame"
     )
+
+
+def middle_of(shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """The part of a frame that is looked at: even numbers of pixels, from even ones on."""
+    sides = [min(n, MOST) // 2 * 2 for n in shape]
+    first = [(n - side) // 4 * 2 for n, side in zip(shape, sides, strict=True)]
+    return tuple(slice(a, a + side) for a, side in zip(first, sides, strict=True))

@@ -4,9 +4,9 @@ import numpy as np
 from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
+from bayesfred.optimize.alternating import middle_of
 
 SMOOTH = 1.5  # pixels, over which a frame is averaged
-MOST = 2048  # pixels along each axis, about the middle, that are looked at
 LOWEST, HIGHEST = 1e-3, 3e-4  # shares of the pixels: a few are dead, and fewer are hot
 DEEP = 10.0  # standard deviations of most pixels
 DEEPER = 4.0  # times the height of what is brightest
@@ -35,7 +35,7 @@ def dark_marks_message(counts: Floats, valid: Flags) -> str:
     >>> dark_marks_message(counts, counts >= 0.0)[:40]
     'the marks are darker than the ground: th'
     """
-    middle = tuple(slice(max(n - MOST, 0) // 2, max(n - MOST, 0) // 2 + MOST) for n in counts.shape)
+    middle = middle_of(counts.shape)
     counts, valid = counts[middle], valid[middle]
     if not valid.any():
         return ""
