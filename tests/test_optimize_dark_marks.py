@@ -6,6 +6,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from bayesfred.optimize import dark_marks
 from bayesfred.optimize.dark_marks import dark_marks_message
 
 Floats = NDArray[np.float64]
@@ -43,7 +44,9 @@ def test_of_a_large_frame_the_middle_tells() -> None:
 
 
 @pytest.mark.parametrize("faint", [300.0, 3e4])
-def test_dead_columns_and_dark_corners_are_no_marks(faint: float) -> None:
+def test_dead_columns_and_dark_corners_are_no_marks(
+    faint: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     frame = dots(4, 0.0)
     rng = np.random.default_rng(5)
     light = np.zeros(frame.shape)
@@ -54,6 +57,10 @@ def test_dead_columns_and_dark_corners_are_no_marks(faint: float) -> None:
     assert not told(frame)
     v, u = np.indices(frame.shape) - np.array([119.5, 149.5])[:, None, None]
     assert not told(np.where(np.hypot(u, v) < 150.0, frame, 40.0))
+    corners = np.where(np.hypot(u, v) < 165.0, dots(4, 0.0), 40.0)
+    assert not told(corners)
+    monkeypatch.setattr(dark_marks, "FEWEST", 4)  # the control: as many as a frame has corners
+    assert told(corners)
 
 
 @pytest.mark.parametrize("name", planted.FAULTS)
