@@ -11,12 +11,13 @@ from emcee import State
 from scipy import stats
 
 import bayesfred as bf
-from bayesfred._typing import Flags, Floats, Ints
+from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.frame_agreement import frame_agreement
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
 from bayesfred.sampling.ensembles import adapted
 from bayesfred.sampling.frame_moves import FrameMove
+from bayesfred.sampling.normal_scores import NormalScores, to_scores
 
 TERMS = bf.PolynomialDistortion([(1, 0, 0, 0), (3, 0, 0, 0)], [(0, 1, 0, 0), (0, 3, 0, 0)])
 MODEL = bf.ForwardModel(
@@ -251,6 +252,23 @@ class Funnel:
         return x
 
 
+class Wide(Funnel):
+    """One frame, with tau also the standard deviation of phi."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def log_parts(self, x: Floats, wanted: Flags | None = None) -> Floats:
+        own, rest = super().log_parts(x, wanted)
+        return np.array([own + stats.norm.logpdf(x[:, 0], 0.0, x[:, 2]), 0.0 * rest])
+
+    def draws(self, n: int) -> Floats:
+        x = super().draws(n)
+        phi = x[:, 2] * np.random.RandomState(6).standard_normal(n)
+        x[:, :2] += (phi - x[:, 0])[:, None]
+        return x
+
+
 def sampled(move: FrameMove, posterior: Any, steps: int, walkers: int) -> Floats:
     """Draws after a tenth of the steps, (n, d)."""
 
@@ -313,23 +331,34 @@ def test_frame_moves_sample_the_right_distribution(k: int, together: bool | None
 
 
 class Forgetful(FrameMove):
-    """Takes the density of a scale for that of its logarithm."""
+    """Takes the density of a scale for that of its score."""
 
-    def _volume(self, y: Floats, columns: Ints | slice = slice(None)) -> Floats:
-        return 0.0 * super()._volume(y, columns)
+    def _volumes(self, y: Floats) -> Floats:
+        return 0.0 * super()._volumes(y)
+
+
+class Unaware(FrameMove):
+    """Forgets that scales widen what a walker's shared parameters are proposed from."""
+
+    def _drawn(self, x: Floats, random: np.random.RandomState) -> tuple[Floats, Floats]:
+        new, _ = super()._drawn(x, random)
+        p = self.centre.size
+        return new, self.shared.log_density(x[:, :p]) - self.shared.log_density(new[:, :p])
 
 
 @pytest.mark.parametrize("fitted", [False, True])
 def test_scales_of_frames_have_the_right_distribution(*, fitted: bool) -> None:
     """Quantiles of phi, tau_i and (nu_i - phi) / tau_i, to 0.02 with some 4,000 effective draws."""
     posterior: Any = Funnel(2)
-    y = posterior.draws(4000)
-    y[:, 2::2] = np.log(y[:, 2::2])
-    worst = {}
+    x = posterior.draws(4000)
+    scores = {k: NormalScores.log_normal(2.5, 0.6) for k in (2, 4)}
+    y, worst = to_scores(x, scores), {}
     for kind in (FrameMove, Forgetful):
-        given = (y,) if fitted else ()
-        move = kind(posterior, y.mean(axis=0), np.cov(y.T), posterior.log_parts, *given)
-        assert len(move.own[0].residual.weights) == (4 if fitted else 1)
+        if fitted:
+            move = kind.fitted(posterior, x, posterior.log_parts)
+            assert move.own[0].residual.funnel[1] > 0.2
+        else:
+            move = kind(posterior, y.mean(axis=0), np.cov(y.T), posterior.log_parts, scores)
         draws = sampled(move, posterior, 600, 64)
         tau = draws[:, 2::2]
         worst[kind] = farthest(
@@ -338,6 +367,19 @@ def test_scales_of_frames_have_the_right_distribution(*, fitted: bool) -> None:
             *((own, stats.norm()) for own in ((draws[:, 1::2] - draws[:, :1]) / tau).T),
         )
     assert worst[FrameMove] < 0.02 and worst[Forgetful] > 0.1
+
+
+def test_scales_that_widen_what_is_shared_leave_its_distribution() -> None:
+    """Quantiles of tau and phi / tau, to 0.02 with some 4,000 effective draws."""
+    posterior: Any = Wide()
+    x, worst = posterior.draws(4000), {}
+    for kind in (FrameMove, Unaware):
+        move = kind.fitted(posterior, x, posterior.log_parts)
+        assert not move.together.any() and move.funnel[2] > 0.3
+        draws = sampled(move, posterior, 600, 64)
+        phi, tau = draws[:, 0], draws[:, 2]
+        worst[kind] = farthest((tau, stats.gamma(3.0)), (phi / tau, stats.norm()))
+    assert worst[FrameMove] < 0.02 and worst[Unaware] > 0.03
 
 
 def test_proposals_are_adapted_to_the_frame_that_moves_least() -> None:

@@ -30,11 +30,10 @@ from bayesfred.sampling.frame_moves import FrameMove, Parts
 from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
-# share of accepted moves below which proposals are adapted; differential evolution alone, when it
-# makes half of them, brings 0.15
-POOR = 0.3
-LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which this is checked, over the latter half of them
-DE_SHARE_ADAPTED = 0.5  # ... where proposals had to be adapted
+# Steps after which proposals are adapted if fewer than this share of moves were accepted in the
+# latter half of them. The draws until then are left out: later there has to be more to gain.
+LOOKS = {8: 0.5, 16: 0.5, 32: 0.5, 64: 0.3, 128: 0.3, 256: 0.3}
+DE_SHARE_ADAPTED = 0.2  # ... where proposals had to be adapted
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
 # share of the largest spread, in standard deviations, below which there is none in a direction
 DEPENDENT = 1e-8
@@ -205,7 +204,11 @@ def adapted(chain: Floats) -> int:
     ----------
     chain : ndarray, shape (ensembles, steps, walkers, d)
     """
-    looks = [look for look in LOOKS if look <= chain.shape[1] and _accepted(chain, look) < POOR]
+    looks = [
+        look
+        for look, poor in LOOKS.items()
+        if look <= chain.shape[1] and _accepted(chain, look) < poor
+    ]
     return max(looks, default=0)
 
 
@@ -243,7 +246,7 @@ def moves_after(
         if made:
             return [(FrameMove.fitted(posterior, draws, parts), 1.0)]
         return [(FrameMove.of(posterior, estimate, parts), 1.0)]
-    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= LOOKS[0])
+    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= min(LOOKS))
     if made:
         share = DE_SHARE_ADAPTED
         with suppress(InputError):  # of too few draws: the next look has more

@@ -11,8 +11,10 @@ I the information. A step has two moves.
    residual r_i = nu_i - B_i (phi - m) stays, which moves nu_i along. One decision for all.
 2. In those others nu_i is drawn again given phi, and each frame decides for itself.
 
-Scales, such as the scatter of a frame's positions, stand for their logarithms throughout: those of
-few sources are known to a factor, so that a normal distribution of their values is none of theirs.
+Scales, such as the scatter of a frame's positions, stand for their normal scores throughout, since
+those of few sources are far from normal: see `normal_scores.py`. Once there are draws, they tell
+how far scales widen the other parameters of their frame, see `LaplaceMove`, and those of the frames
+that are not drawn with phi the distance of phi from m. B_i has no rows for scales.
 
 Proposals for k frames at once are accepted by the sum of k log-ratios of posterior and proposal. If
 frame i's has the variance s_i^2, that of the sum is s^2 = sum s_i^2, and the draws' autocorrelation
@@ -27,6 +29,7 @@ L. Tierney (1994), Annals of Statistics 22, 1701 (independence chains, and mixin
 """
 
 from collections.abc import Callable
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,14 +37,20 @@ from emcee import State
 from emcee.moves import Move
 from scipy.special import ndtr
 
-from bayesfred._typing import Flags, Floats, Ints
+from bayesfred._typing import Flags, Floats
 from bayesfred.model.joint import JointPosterior
 from bayesfred.optimize.estimate import MapEstimate, inverse
-from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove
+from bayesfred.sampling.moves import HEAVY_SHARE, LaplaceMove, funnel_of, moments
+from bayesfred.sampling.normal_scores import (
+    NormalScores,
+    Scores,
+    log_slopes,
+    to_scores,
+    to_values,
+)
 
+DRAWS_A_SCALE = 100  # fewer do not tell how much each of many scales widens what is shared
 PROBES = (3, 8)  # shared parameters, and own ones for each, that show how normal frames are
-LARGEST = 300.0  # logarithm of a scale
-PARTS = 4  # of the draws, by a frame's first scale
 KEPT = 4096  # parameter vectors whose log-densities are kept, those of all walkers among them
 
 Parts = Callable[[Floats, Flags | None], Floats]
@@ -62,23 +71,23 @@ class FrameMove(Move):  # type: ignore[misc]
     posterior : JointPosterior
     mean : ndarray, shape (d,)
     covariance : ndarray, shape (d, d)
-        Those of the proposals, scales by their logarithms; the frames' own parameters are taken as
+        Those of the proposals, scales by their scores; the frames' own parameters are taken as
         independent given the shared ones.
     log_parts : callable
         As `JointPosterior.log_parts`.
+    scores : mapping of int to NormalScores, optional
+        Those of the scales.
     draws : ndarray, shape (n, d), optional
-        Of the posterior: a scale sets how far what it is a scale of spreads, so that a frame's own
-        parameters then have a proposal for each quarter of its draws.
+        Of the posterior, scales by their scores.
     """
 
     def __init__(
-        self, posterior: JointPosterior, mean: Floats, covariance: Floats, log_parts: Parts,
-        draws: Floats | None = None,
+        self, posterior: JointPosterior, mean: Floats, covariance: Floats,
+        log_parts: Parts, scores: Scores = MappingProxyType({}), draws: Floats | None = None,
     ) -> None:  # fmt: skip
         p = posterior.n_shared
         low, high = posterior.support
-        self.posterior, self.log_parts = posterior, log_parts
-        self.scales = posterior.scales
+        self.posterior, self.scores, self.log_parts = posterior, scores, log_parts
         self.centre = mean[:p]
         block = covariance[:p, :p]
         self.shared = LaplaceMove(mean[:p], block, support=(low[:p], high[:p]))
@@ -87,17 +96,27 @@ class FrameMove(Move):  # type: ignore[misc]
         for part in posterior.parts:
             cross = covariance[part.own, :p]
             slopes = cross @ known
-            given = covariance[np.ix_(part.own, part.own)] - slopes @ cross.T
-            approximation = mean[part.own], 0.5 * (given + given.T)
-            scales = np.flatnonzero(self.scales[part.own])
-            if draws is not None and scales.size and len(draws) > 2 * PARTS * part.own.size:
+            slopes[posterior.scales[part.own]] = 0.0
+            given = covariance[np.ix_(part.own, part.own)] + slopes @ block @ slopes.T
+            given -= slopes @ cross.T + cross @ slopes.T
+            own, funnel = (mean[part.own], given), np.zeros(part.own.size)
+            scales = np.flatnonzero(posterior.scales[part.own]).tolist()
+            if draws is not None and scales and len(draws) > 2 * part.own.size:
                 residuals = draws[:, part.own] - (draws[:, :p] - self.centre) @ slopes.T
-                approximation = _by_scale(residuals, scales[0])
-            shares = np.full(approximation[0].size // part.own.size, 1.0)
-            residual = LaplaceMove(*approximation, shares / shares.size, heavy_share=0.0)
+                funnel[scales] = funnel_of(residuals, scales)
+                own = moments(residuals, funnel)
+            residual = LaplaceMove(*own, heavy_share=0.0, funnel=funnel)
             self.own.append(_Own(slopes, residual))
         self.kept: dict[bytes, Floats] = {}
+        self.mean, self.funnel = mean, np.zeros(mean.size)
+        columns = np.flatnonzero(posterior.scales)
+        bounded, enough = len(self.shared.bounds) > 0, DRAWS_A_SCALE * columns.size
+        if draws is not None and not bounded and 0 < enough < len(draws):
+            both = draws[:, np.r_[:p, columns]]
+            self.funnel[columns] = funnel_of(both, range(p, both.shape[1]))
         self.together = self._together()
+        for i in np.flatnonzero(self.together):  # whose scales are drawn at the same time
+            self.funnel[posterior.parts[i].own] = 0.0
         for i in np.flatnonzero(~self.together):  # of many together one far out would refuse all
             self.own[i].residual.heavy_share = HEAVY_SHARE
 
@@ -110,27 +129,25 @@ class FrameMove(Move):  # type: ignore[misc]
         mean, (low, high) = estimate.params, posterior.support
         if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
             mean = mean + covariance @ posterior.gradient(mean)
-        scales = posterior.scales
-        typical = np.maximum(mean, np.sqrt(np.diag(covariance)))[scales]
-        mean, unit = mean.copy(), np.ones(mean.size)
-        mean[scales], unit[scales] = np.log(typical), typical
-        return cls(posterior, mean, covariance / np.outer(unit, unit), log_parts)
+        sd, mean, unit, scores = np.sqrt(np.diag(covariance)), mean.copy(), np.ones(mean.size), {}
+        for k in np.flatnonzero(posterior.scales).tolist():
+            typical = max(mean[k], sd[k])
+            scores[k] = NormalScores.log_normal(typical, sd[k] / typical)
+            mean[k], unit[k] = 0.0, sd[k]
+        return cls(posterior, mean, covariance / np.outer(unit, unit), log_parts, scores)
 
     @classmethod
     def fitted(cls, posterior: JointPosterior, draws: Floats, log_parts: Parts) -> "FrameMove":
         """The move with the mean and covariance of draws, shape (n, d)."""
-        y = _logarithms(draws, posterior.scales)
-        return cls(posterior, y.mean(axis=0), np.cov(y.T, ddof=0), log_parts, y)
+        scales = np.flatnonzero(posterior.scales).tolist()
+        scores = {k: NormalScores.of_draws(draws[:, k]) for k in scales}
+        y = to_scores(draws, scores)
+        return cls(posterior, y.mean(axis=0), np.cov(y.T, ddof=0), log_parts, scores, y)
 
-    def _values(self, y: Floats) -> Floats:
-        """The parameters themselves."""
-        x = y.copy()
-        x[:, self.scales] = np.exp(np.minimum(y[:, self.scales], LARGEST))
-        return x
-
-    def _volume(self, y: Floats, columns: Ints | slice = slice(None)) -> Floats:
-        """Logarithm of the volume of scales over that of their logarithms."""
-        return np.asarray(y[:, columns][:, self.scales[columns]].sum(axis=1))
+    def _volumes(self, y: Floats) -> Floats:
+        """Logarithm of the volume of scales over that of their scores, shape (k, n)."""
+        slopes = log_slopes(y, self.scores)
+        return np.array([slopes[:, part.own].sum(axis=1) for part in self.posterior.parts])
 
     def _drawn(self, x: Floats, random: np.random.RandomState) -> tuple[Floats, Floats]:
         """Vectors whose shared parameters are new, and log q(old) - log q(new) of these.
@@ -139,10 +156,13 @@ class FrameMove(Move):  # type: ignore[misc]
         """
         p = self.centre.size
         new = x.copy()
-        new[:, :p] = self.shared.draw(len(x), random)
+        wider = np.exp((x - self.mean) @ self.funnel)[:, None]
+        before = self.centre + (x[:, :p] - self.centre) / wider
+        drawn = self.shared.draw(len(x), random)
+        new[:, :p] = self.centre + (drawn - self.centre) * wider
         for part, own in zip(self.posterior.parts, self.own, strict=True):
             new[:, part.own] += (new[:, :p] - x[:, :p]) @ own.slopes.T
-        return new, self.shared.log_density(x[:, :p]) - self.shared.log_density(new[:, :p])
+        return new, self.shared.log_density(before) - self.shared.log_density(drawn)
 
     def _redraw(self, i: int, x: Floats, random: np.random.RandomState) -> Floats:
         """Draw the own parameters of frame i again, in place; log q(old) - log q(new)."""
@@ -166,8 +186,8 @@ class FrameMove(Move):  # type: ignore[misc]
             residual = own.residual.draw(n, random)
             x[:, self.posterior.parts[i].own] = residual + self._moved(own, x)
             log_q[i] = own.residual.log_density(residual)
-        log_q -= [self._volume(x, part.own) for part in self.posterior.parts]
-        ratio = (self.log_parts(self._values(x), None)[:-1] - log_q).reshape(k, *PROBES)
+        there = self.log_parts(to_values(x, self.scores), None)[:-1] + self._volumes(x)
+        ratio = (there - log_q).reshape(k, *PROBES)
         with np.errstate(invalid="ignore"):
             variance = ratio.var(axis=2, ddof=1).mean(axis=1)
         variance = np.nan_to_num(variance, nan=np.inf)
@@ -181,17 +201,19 @@ class FrameMove(Move):  # type: ignore[misc]
     def propose(self, model: Any, state: State) -> tuple[State, Flags]:
         """New positions for all walkers, and which have new shared parameters."""
         random, before, n = model.random, state.coords, len(state.coords)
-        y = first = _logarithms(before, self.scales)
+        y = first = to_scores(before, self.scores)
         parts = self._parts_at(before)
 
         def values(y: Floats) -> Floats:
-            return np.where(y == first, before, self._values(y))  # what stays, to the last bit
+            return np.where(
+                y == first, before, to_values(y, self.scores)
+            )  # what stays, to the last bit
 
         new, factor = self._drawn(y, random)
         for i in np.flatnonzero(self.together).tolist():
             factor += self._redraw(i, new, random)
+        factor += (self._volumes(new) - self._volumes(y)).sum(axis=0)
         there = self.log_parts(values(new), None)
-        factor += self._volume(new) - self._volume(y)
         with np.errstate(invalid="ignore"):
             ratio = there.sum(axis=0) - parts.sum(axis=0) + factor
         accepted = np.log(random.random_sample(n)) < ratio
@@ -200,10 +222,10 @@ class FrameMove(Move):  # type: ignore[misc]
         if not self.together.all():
             new, alone = y.copy(), np.flatnonzero(~self.together).tolist()
             factors = np.array([self._redraw(i, new, random) for i in alone])
+            factors += (self._volumes(new) - self._volumes(y))[alone]
             there = self.log_parts(values(new), ~self.together)
             for i, own_factor in zip(alone, factors, strict=True):
                 columns = self.posterior.parts[i].own
-                own_factor = own_factor + self._volume(new, columns) - self._volume(y, columns)
                 with np.errstate(invalid="ignore"):
                     ratio = there[i] - parts[i] + own_factor
                 taken = np.flatnonzero(np.log(random.random_sample(n)) < ratio)
@@ -224,22 +246,6 @@ class FrameMove(Move):  # type: ignore[misc]
             for k, column in zip(missing, self.log_parts(x[missing], None).T, strict=True):
                 out[k] = column
         return np.array(out).T
-
-
-def _by_scale(draws: Floats, scale: int) -> tuple[Floats, Floats]:
-    """Means and covariances of draws in parts of equal number, by a column."""
-    parts = np.array_split(draws[np.argsort(draws[:, scale], kind="stable")], PARTS)
-    return np.stack([part.mean(axis=0) for part in parts]), np.stack(
-        [np.cov(part.T, ddof=0) for part in parts]
-    )
-
-
-def _logarithms(x: Floats, scales: Flags) -> Floats:
-    """Parameter vectors with the logarithms of scales."""
-    y = x.copy()
-    with np.errstate(divide="ignore"):
-        y[:, scales] = np.log(x[:, scales])
-    return y
 
 
 def _correlation(s: float) -> float:

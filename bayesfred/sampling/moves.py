@@ -7,6 +7,7 @@ evolution for posteriors that are not.
 """
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,17 @@ from scipy.stats import norm, truncnorm
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
+from bayesfred.model.parameters import SCALES
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.sampling.approximations import approximations
+from bayesfred.sampling.normal_scores import (
+    NormalScores,
+    Scores,
+    log_slopes,
+    to_scores,
+    to_values,
+)
 
 HEAVY_SHARE = 0.05
 DEGREES_OF_FREEDOM = 5.0
@@ -49,6 +58,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
     z with L lower triangular, and z_i a normal variable cut to an interval that depends on z_1 to
     z_(i-1). That divides the normal density by the product of the intervals' masses.
 
+    Where some parameters are scales that set the errors of the others, the posterior is a funnel.
+    The distances of the others from m are then multiplied by exp(g (x - m)), g being zero but for
+    the scales. Near a bound of the prior they are not.
+
     Parameters
     ----------
     mean : ndarray, shape (d,) or (k, d)
@@ -61,6 +74,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         Least and largest values that the prior admits.
     heavy_share : float
         w; 0 leaves the normal distributions alone.
+    scores : mapping of int to NormalScores, optional
+        Of parameters for whose scores m, C and the support are given.
+    funnel : array_like, shape (d,), optional
+        g.
 
     Raises
     ------
@@ -89,6 +106,8 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         support: tuple[npt.ArrayLike, npt.ArrayLike] = (-np.inf, np.inf),
         *,
         heavy_share: float = HEAVY_SHARE,
+        scores: Scores = MappingProxyType({}),
+        funnel: npt.ArrayLike = 0.0,
     ) -> None:
         # the proposal does not come from the ensemble, whatever its size: all walkers move at once
         super().__init__(nsplits=1, randomize_split=False, live_dangerously=True)
@@ -111,7 +130,9 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         self.bounds = np.stack([low, high], axis=1)[near]
         self.means = means[:, self.order]
         self.weights = np.asarray(weights, dtype=np.float64)
-        self.heavy_share = heavy_share
+        self.heavy_share, self.scores = heavy_share, scores
+        self.funnel = np.broadcast_to(np.asarray(funnel, np.float64), d)[self.order]
+        self.widened = (self.funnel == 0.0) & ~near[self.order]  # by the funnel
 
     @classmethod
     def of(
@@ -149,12 +170,24 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         modes, d = estimate.mixture, draws.shape[1]
         means, covariances = modes.means.copy(), modes.covariances.copy()
         own, number = modes.assign(draws), np.ones(len(means))
+        scores = {
+            k: NormalScores.of_draws(draws[:, k])
+            for k, name in enumerate(posterior.parameter_names)
+            if name in SCALES
+        }
+        y, support = to_scores(draws, scores), np.array(posterior.support)
+        support[:, list(scores)] = [[-np.inf], [np.inf]]
+        funnel, columns = np.zeros(d), list(scores)
+        if columns and len(y) > 2 * d:
+            funnel[columns] = funnel_of(y, columns)
         for k in range(len(means)):
-            some = draws[own == k]
+            some = y[own == k]
             if len(some) > 2 * d or len(means) == 1:
-                means[k], covariances[k] = some.mean(axis=0), np.cov(some.T, ddof=0)
+                means[k], covariances[k] = moments(some, funnel)
             number[k] += len(some)
-        return cls(means, covariances, number / number.sum(), posterior.support)
+        bounds = support[0], support[1]
+        weights = number / number.sum()
+        return cls(means, covariances, weights, bounds, scores=scores, funnel=funnel)
 
     def draw(self, n: int, random: np.random.RandomState, heavy: Flags | None = None) -> Floats:
         """n draws from the proposal, shape (n, d); `heavy` ones are from the share with tails.
@@ -172,9 +205,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         z *= np.where(heavy, stretch, 1.0)[:, None]
         x = np.empty_like(z)
         for j, (mean, lower) in enumerate(zip(self.means, self.lowers, strict=True)):
-            own = k == j
-            x[np.ix_(own, self.order)] = mean + np.einsum("ij,nj->ni", lower, z[own])
-        return x
+            own, off = k == j, np.einsum("ij,nj->ni", lower, z[k == j])
+            off[:, self.widened] *= np.exp(off @ self.funnel)[:, None]
+            x[np.ix_(own, self.order)] = mean + off
+        return to_values(x, self.scores)
 
     def _interval(self, i: int, means: Floats, row: Floats, z: Floats) -> Floats:
         """The interval of z_i that keeps the i-th of the parameters near a bound in the support.
@@ -188,9 +222,12 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         """log q at x, shape (n, d)."""
         d, nu = x.shape[1], DEGREES_OF_FREEDOM
         peak = gammaln(0.5 * (nu + d)) - gammaln(0.5 * nu) - 0.5 * d * np.log(nu * np.pi)
-        parts = []
+        parts, x = [], to_scores(x, self.scores)
         for mean, lower, weight in zip(self.means, self.lowers, self.weights, strict=True):
-            z = solve_triangular(lower, (x[:, self.order] - mean).T, lower=True).T
+            off = x[:, self.order] - mean
+            wider = off @ self.funnel
+            off[:, self.widened] *= np.exp(-wider)[:, None]
+            z = solve_triangular(lower, off.T, lower=True).T
             squared = (z**2).sum(axis=1)
             normal = np.log1p(-self.heavy_share) - 0.5 * squared - 0.5 * d * np.log(2.0 * np.pi)
             for i in range(len(self.bounds)):
@@ -200,8 +237,10 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
             if self.heavy_share:
                 student = peak - 0.5 * (nu + d) * np.log1p(squared / nu)
                 normal = np.logaddexp(normal, np.log(self.heavy_share) + student)
-            parts.append(normal + np.log(weight) - np.log(np.diag(lower)).sum())
-        return np.asarray(np.logaddexp.reduce(parts, axis=0))
+            normal -= np.log(np.diag(lower)).sum() + self.widened.sum() * wider
+            parts.append(normal + np.log(weight))
+        slopes = log_slopes(x, self.scores).sum(axis=1)
+        return np.asarray(np.logaddexp.reduce(parts, axis=0) - slopes)
 
     def get_proposal(
         self, s: Floats, c: Sequence[Floats], random: np.random.RandomState
@@ -213,3 +252,33 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         new = self.draw(len(s), random)
         before, after = np.split(self.log_density(np.concatenate([s, new])), 2)
         return new, before - after
+
+
+def funnel_of(draws: Floats, scales: Sequence[int]) -> Floats:
+    """How scales widen the other parameters: see `LaplaceMove`.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (n, d)
+    scales : sequence of int
+        Columns of the scales.
+
+    Returns
+    -------
+    ndarray, shape (scales,)
+        The growth of the logarithm of the others' mean distance from their mean, that of normal
+        distributions with the same covariance being 1.
+    """
+    of = np.column_stack([np.ones(len(draws)), draws[:, scales] - draws[:, scales].mean(axis=0)])
+    others = np.delete(draws, scales, axis=1)
+    left = others - of @ np.linalg.lstsq(of, others)[0]
+    z = solve_triangular(cholesky(np.cov(left.T, ddof=0), lower=True), left.T, lower=True)
+    return np.asarray(np.linalg.lstsq(of, 0.5 * np.log((z**2).mean(axis=0)))[0][1:])
+
+
+def moments(draws: Floats, funnel: Floats) -> tuple[Floats, Floats]:
+    """Mean and covariance of draws, shape (n, d), without what the funnel widens."""
+    mean = draws.mean(axis=0)
+    off = draws - mean
+    off[:, funnel == 0.0] *= np.exp(-off @ funnel)[:, None]
+    return mean, np.cov(off.T, ddof=0)

@@ -1,0 +1,132 @@
+"""Scales by their normal scores, and funnels: see `normal_scores.py` and `LaplaceMove`."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from test_model import LIMIT
+
+from bayesfred._typing import Floats
+from bayesfred.model.protocol import TargetDensity
+from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.sampling.moves import LaplaceMove, funnel_of
+from bayesfred.sampling.normal_scores import NormalScores, log_slopes, to_scores
+
+DIMENSIONS = 8  # besides the scale, of the funnel
+
+
+class Funnel(TargetDensity):
+    """A scale, and parameters of which it is the standard deviation."""
+
+    parameter_names = ("position_scatter", *(f"x{i}" for i in range(DIMENSIONS)))  # type: ignore[assignment]
+    support = (  # type: ignore[assignment]
+        np.array([0.0, *[-np.inf] * DIMENSIONS]),
+        np.full(1 + DIMENSIONS, np.inf),
+    )
+
+    def __init__(self, shape: float) -> None:
+        self.scale = stats.gamma(shape, scale=0.1)
+
+    def log_prob(self, params: Any) -> Floats:
+        tau, x = params[:, 0], params[:, 1:]
+        wide = 0.3 + tau[:, None]
+        return np.asarray(self.scale.logpdf(tau) + stats.norm.logpdf(x, 1.0, wide).sum(axis=1))
+
+    def draws(self, n: int) -> Floats:
+        random = np.random.RandomState(1)
+        tau = self.scale.rvs(n, random_state=random)
+        x = 1.0 + (0.3 + tau[:, None]) * random.standard_normal((n, DIMENSIONS))
+        return np.column_stack([tau, x])
+
+    @property
+    def fitted(self) -> LaplaceMove:
+        draws = self.draws(4000)
+        estimate = MapEstimate(draws.mean(axis=0), np.cov(draws.T), 0.0, 1, "", True, True)
+        return LaplaceMove.fitted(self, estimate, draws)
+
+
+def half_normal(n: int) -> Floats:
+    return np.abs(np.random.default_rng(1).standard_normal(n))
+
+
+SCORES = [
+    NormalScores.log_normal(0.01, 0.8),
+    NormalScores.of_draws(half_normal(2000)),
+    NormalScores.of_draws(5.0 + np.random.default_rng(2).standard_normal(2000)),
+]
+
+
+@pytest.mark.parametrize("scores", SCORES)
+def test_values_have_their_scores_and_slopes(scores: NormalScores) -> None:
+    z = np.linspace(-8.0, 8.0, 123)
+    assert scores.at(scores.values(z)) == pytest.approx(z, abs=1e-9)
+    z = z[np.abs(z[:, None] - scores.scores).min(axis=1) > 1e-3]  # slopes have steps at the knots
+    h = 1e-6
+    slope = np.log((scores.values(z + h) - scores.values(z - h)) / (2.0 * h))
+    assert scores.log_slope(z) == pytest.approx(slope, abs=1e-7)
+
+
+def test_scores_of_draws_are_normal() -> None:
+    """Shares of 40,000 draws below quantiles, whose knots are those of others; error 0.005."""
+    scores = NormalScores.of_draws(half_normal(10_000))
+    z = scores.at(np.abs(np.random.default_rng(3).standard_normal(40_000)))
+    for q in (0.01, 0.1, 0.5, 0.9, 0.99):
+        assert np.mean(z < stats.norm.ppf(q)) == pytest.approx(q, abs=0.02)
+    assert np.mean(np.log(half_normal(40_000)) < stats.norm.ppf(0.1)) > 0.15  # logarithms are not
+
+
+def test_a_scale_that_may_be_zero_is_proposed_there() -> None:
+    """The posterior's density over the proposal's, where a walker might not leave zero."""
+    draws, s = half_normal(10_000), np.geomspace(1e-9, 3.5, 500)[:, None]
+    scores = {0: NormalScores.of_draws(draws)}
+    y, logs = to_scores(draws[:, None], scores), np.log(draws)
+    log_p = stats.halfnorm.logpdf(s[:, 0])
+    by_scores = LaplaceMove(y.mean(axis=0), np.cov(y.T).reshape(1, 1), scores=scores)
+    assert np.max(log_p - by_scores.log_density(s)) < np.log(1.5)
+    by_logs = LaplaceMove(logs.mean(keepdims=True), np.cov(logs).reshape(1, 1), heavy_share=0.0)
+    assert np.max(log_p - by_logs.log_density(np.log(s)) + np.log(s[:, 0])) > np.log(100.0)
+
+
+def test_draws_from_a_funnel_follow_its_density() -> None:
+    """Under draws from q the mean of p / q is 1, but not without the scores' or funnel's volume."""
+    target = Funnel(3.0)
+    move = target.fitted
+    assert move.scores.keys() == {0} and move.funnel[0] > 0.1 and move.widened.sum() == DIMENSIONS
+    x = move.draw(200_000, np.random.RandomState(3))
+    log_q, y = move.log_density(x), to_scores(x, move.scores)
+    slopes = log_slopes(y, move.scores)[:, 0]
+    wider = DIMENSIONS * move.funnel[0] * (y[:, 0] - move.means[0, 0])
+    off = []
+    for more in (0.0, slopes, wider):
+        weight = np.exp(target.log_prob(x) - log_q - more)
+        off.append(abs(weight.mean() - 1.0) / (weight.std() / np.sqrt(weight.size)))
+    assert off[0] < LIMIT and min(off[1:]) > 3.0 * LIMIT
+
+
+def test_funnel_of_draws() -> None:
+    """A tenth of the slope is five errors with 4,000 draws of 10 parameters."""
+    random = np.random.default_rng(5)
+    scales, others = random.standard_normal((4000, 2)), random.standard_normal((4000, 10))
+    others = (others * np.exp(scales @ [0.15, -0.05])[:, None]) @ random.standard_normal((10, 10))
+    draws = np.column_stack([others[:, :4], scales, others[:, 4:]])
+    assert funnel_of(draws, [4, 5]) == pytest.approx([0.15, -0.05], abs=0.015)
+
+
+def accepted(move: LaplaceMove, target: Funnel) -> Floats:
+    """The share of proposals that each of 2,000 draws of the target accepts, 50 proposals each."""
+    x, random = target.draws(2000), np.random.RandomState(4)
+    new = move.draw(50, random)
+    gain = target.log_prob(new) - move.log_density(new)
+    here = target.log_prob(x) - move.log_density(x)
+    return np.asarray(np.exp(np.minimum(gain - here[:, None], 0.0)).mean(axis=1))
+
+
+@pytest.mark.parametrize("shape", [1.0, 3.0])
+def test_walkers_are_not_stuck_where_a_scale_is_small(shape: float) -> None:
+    """The tenth that moves least, by adapted proposals and by those that a plain normal makes."""
+    target = Funnel(shape)
+    x = target.draws(4000)
+    plain = LaplaceMove(x.mean(axis=0), np.cov(x.T), support=target.support)
+    least = [np.quantile(accepted(move, target), 0.1) for move in (target.fitted, plain)]
+    assert least[0] > 3.0 * least[1]
