@@ -253,18 +253,18 @@ class Funnel:
 
 
 class Wide(Funnel):
-    """One frame, with tau also the standard deviation of phi."""
+    """One frame, with tau also the mean and standard deviation of phi."""
 
     def __init__(self) -> None:
         super().__init__(1)
 
     def log_parts(self, x: Floats, wanted: Flags | None = None) -> Floats:
         own, rest = super().log_parts(x, wanted)
-        return np.array([own + stats.norm.logpdf(x[:, 0], 0.0, x[:, 2]), 0.0 * rest])
+        return np.array([own + stats.norm.logpdf(x[:, 0], x[:, 2], x[:, 2]), 0.0 * rest])
 
     def draws(self, n: int) -> Floats:
         x = super().draws(n)
-        phi = x[:, 2] * np.random.RandomState(6).standard_normal(n)
+        phi = x[:, 2] * (1.0 + np.random.RandomState(6).standard_normal(n))
         x[:, :2] += (phi - x[:, 0])[:, None]
         return x
 
@@ -369,17 +369,29 @@ def test_scales_of_frames_have_the_right_distribution(*, fitted: bool) -> None:
     assert worst[FrameMove] < 0.02 and worst[Forgetful] > 0.1
 
 
-def test_scales_that_widen_what_is_shared_leave_its_distribution() -> None:
+@pytest.mark.parametrize("together", [False, True])
+def test_scales_that_widen_what_is_shared_leave_its_distribution(
+    *, together: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Quantiles of tau and phi / tau, to 0.02 with some 4,000 effective draws."""
     posterior: Any = Wide()
+    monkeypatch.setattr(FrameMove, "_together", lambda self: np.array([together]))
     x, worst = posterior.draws(4000), {}
     for kind in (FrameMove, Unaware):
         move = kind.fitted(posterior, x, posterior.log_parts)
-        assert not move.together.any() and move.funnel[2] > 0.3
+        assert (move.funnel[2] > 0.2) is not together
         draws = sampled(move, posterior, 600, 64)
         phi, tau = draws[:, 0], draws[:, 2]
-        worst[kind] = farthest((tau, stats.gamma(3.0)), (phi / tau, stats.norm()))
-    assert worst[FrameMove] < 0.02 and worst[Unaware] > 0.03
+        worst[kind] = farthest((tau, stats.gamma(3.0)), (phi / tau - 1.0, stats.norm()))
+    assert worst[FrameMove] < 0.02 and (together or worst[Unaware] > 0.03)
+
+
+def test_scales_do_not_widen_what_a_prior_cuts() -> None:
+    posterior: Any = Wide()
+    posterior.support[0][0] = -1.0
+    assert not np.any(
+        FrameMove.fitted(posterior, posterior.draws(4000), posterior.log_parts).funnel
+    )
 
 
 def test_proposals_are_adapted_to_the_frame_that_moves_least() -> None:

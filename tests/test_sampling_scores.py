@@ -20,23 +20,29 @@ class Funnel(TargetDensity):
     """A scale, and parameters of which it is the standard deviation."""
 
     parameter_names = ("position_scatter", *(f"x{i}" for i in range(DIMENSIONS)))  # type: ignore[assignment]
-    support = (  # type: ignore[assignment]
-        np.array([0.0, *[-np.inf] * DIMENSIONS]),
-        np.full(1 + DIMENSIONS, np.inf),
-    )
+    support = (np.empty(0), np.empty(0))
 
-    def __init__(self, shape: float) -> None:
-        self.scale = stats.gamma(shape, scale=0.1)
+    def __init__(self, shape: float, cut: float = -np.inf) -> None:
+        self.scale, self.cut = stats.gamma(shape, scale=0.1), cut
+        self.support = (
+            np.array([0.0, cut, *[-np.inf] * (DIMENSIONS - 1)]),
+            np.full(1 + DIMENSIONS, np.inf),
+        )
 
     def log_prob(self, params: Any) -> Floats:
         tau, x = params[:, 0], params[:, 1:]
         wide = 0.3 + tau[:, None]
-        return np.asarray(self.scale.logpdf(tau) + stats.norm.logpdf(x, 1.0, wide).sum(axis=1))
+        inside = np.where(x[:, 0] > self.cut, -stats.norm.logsf(self.cut, 1.0, wide[:, 0]), -np.inf)
+        own = stats.norm.logpdf(x, 1.0, wide).sum(axis=1)
+        return np.asarray(self.scale.logpdf(tau) + own + inside)
 
     def draws(self, n: int) -> Floats:
         random = np.random.RandomState(1)
         tau = self.scale.rvs(n, random_state=random)
         x = 1.0 + (0.3 + tau[:, None]) * random.standard_normal((n, DIMENSIONS))
+        x[:, 0] = stats.truncnorm.rvs(
+            (self.cut - 1.0) / (0.3 + tau), np.inf, 1.0, 0.3 + tau, random_state=random
+        )
         return np.column_stack([tau, x])
 
     @property
@@ -88,15 +94,16 @@ def test_a_scale_that_may_be_zero_is_proposed_there() -> None:
     assert np.max(log_p - by_logs.log_density(np.log(s)) + np.log(s[:, 0])) > np.log(100.0)
 
 
-def test_draws_from_a_funnel_follow_its_density() -> None:
+@pytest.mark.parametrize("cut", [-np.inf, 0.5])
+def test_draws_from_a_funnel_follow_its_density(cut: float) -> None:
     """Under draws from q the mean of p / q is 1, but not without the scores' or funnel's volume."""
-    target = Funnel(3.0)
-    move = target.fitted
-    assert move.scores.keys() == {0} and move.funnel[0] > 0.1 and move.widened.sum() == DIMENSIONS
+    target = Funnel(3.0, cut)
+    move, widened = target.fitted, DIMENSIONS - np.isfinite(cut)
+    assert move.scores.keys() == {0} and move.funnel.max() > 0.1 and move.widened.sum() == widened
     x = move.draw(200_000, np.random.RandomState(3))
     log_q, y = move.log_density(x), to_scores(x, move.scores)
     slopes = log_slopes(y, move.scores)[:, 0]
-    wider = DIMENSIONS * move.funnel[0] * (y[:, 0] - move.means[0, 0])
+    wider = widened * ((y[:, move.order] - move.means) @ move.funnel)
     off = []
     for more in (0.0, slopes, wider):
         weight = np.exp(target.log_prob(x) - log_q - more)
