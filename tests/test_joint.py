@@ -380,6 +380,7 @@ def test_scales_that_widen_what_is_shared_leave_its_distribution(
     for kind in (FrameMove, Unaware):
         move = kind.fitted(posterior, x, posterior.log_parts)
         assert (move.funnel[2] > 0.2) is not together
+        assert move.own[0].slopes[1, 0] == 0.0  # what widens stays
         draws = sampled(move, posterior, 600, 64)
         phi, tau = draws[:, 0], draws[:, 2]
         worst[kind] = farthest((tau, stats.gamma(3.0)), (phi / tau - 1.0, stats.norm()))
@@ -401,6 +402,14 @@ def test_proposals_are_adapted_to_the_frame_that_moves_least() -> None:
     stuck = np.repeat(chain[:, ::8, :, 2], 8, axis=1)
     chain[..., 2] = stuck
     assert adapted(chain) == 32
+
+
+@pytest.mark.parametrize(("accepted", "made"), [(0.6, 0), (0.4, 32), (0.2, 64)])
+def test_proposals_are_adapted_early_for_little(accepted: float, made: int) -> None:
+    """Before step 32 where half of the moves are refused, later where most are."""
+    random = np.random.default_rng(1)
+    moved = random.random((2, 64, 200, 1)) < accepted
+    assert adapted(np.cumsum(moved, axis=1).astype(float)) == made
 
 
 def test_nearly_normal_frames_are_drawn_together(

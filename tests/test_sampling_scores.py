@@ -10,7 +10,7 @@ from test_model import LIMIT
 from bayesfred._typing import Floats
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.sampling.moves import LaplaceMove, funnel_of
+from bayesfred.sampling.moves import LaplaceMove, funnel_of, moments
 from bayesfred.sampling.normal_scores import NormalScores, log_slopes, to_scores
 
 DIMENSIONS = 8  # besides the scale, of the funnel
@@ -82,12 +82,14 @@ def test_scores_of_draws_are_normal() -> None:
     assert np.mean(np.log(half_normal(40_000)) < stats.norm.ppf(0.1)) > 0.15  # logarithms are not
 
 
-def test_a_scale_that_may_be_zero_is_proposed_there() -> None:
+@pytest.mark.parametrize("mode", [0.0, 1.5])
+def test_a_scale_that_may_be_zero_is_proposed_there(mode: float) -> None:
     """The posterior's density over the proposal's, where a walker might not leave zero."""
-    draws, s = half_normal(10_000), np.geomspace(1e-9, 3.5, 500)[:, None]
+    target, s = stats.truncnorm(-mode, np.inf, mode), np.geomspace(1e-9, mode + 3.5, 500)[:, None]
+    draws = target.rvs(10_000, random_state=np.random.RandomState(1))
     scores = {0: NormalScores.of_draws(draws)}
     y, logs = to_scores(draws[:, None], scores), np.log(draws)
-    log_p = stats.halfnorm.logpdf(s[:, 0])
+    log_p = target.logpdf(s[:, 0])
     by_scores = LaplaceMove(y.mean(axis=0), np.cov(y.T).reshape(1, 1), scores=scores)
     assert np.max(log_p - by_scores.log_density(s)) < np.log(1.5)
     by_logs = LaplaceMove(logs.mean(keepdims=True), np.cov(logs).reshape(1, 1), heavy_share=0.0)
@@ -115,9 +117,15 @@ def test_funnel_of_draws() -> None:
     """A tenth of the slope is five errors with 4,000 draws of 10 parameters."""
     random = np.random.default_rng(5)
     scales, others = random.standard_normal((4000, 2)), random.standard_normal((4000, 10))
-    others = (others * np.exp(scales @ [0.15, -0.05])[:, None]) @ random.standard_normal((10, 10))
+    mixed = random.standard_normal((10, 10))
+    others = (others * np.exp(scales @ [0.15, -0.05])[:, None]) @ mixed
     draws = np.column_stack([others[:, :4], scales, others[:, 4:]])
     assert funnel_of(draws, [4, 5]) == pytest.approx([0.15, -0.05], abs=0.015)
+    _, covariance = moments(draws, np.array([0.0] * 4 + [0.15, -0.05] + [0.0] * 6))
+    own = np.delete(np.delete(covariance, [4, 5], 0), [4, 5], 1)
+    expected = mixed.T @ mixed
+    assert own == pytest.approx(expected, abs=0.1 * np.diag(expected).max())
+    assert np.trace(np.cov(draws.T)) > 1.04 * np.trace(covariance)
 
 
 def accepted(move: LaplaceMove, target: Funnel) -> Floats:
