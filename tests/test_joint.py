@@ -15,7 +15,7 @@ from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.frame_agreement import frame_agreement
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
-from bayesfred.sampling.ensembles import adapted
+from bayesfred.sampling.ensembles import adapted, moves_after
 from bayesfred.sampling.frame_moves import FrameMove
 from bayesfred.sampling.normal_scores import NormalScores, to_scores
 
@@ -410,6 +410,21 @@ def test_proposals_are_adapted_early_for_little(accepted: float, made: int) -> N
     random = np.random.default_rng(1)
     moved = random.random((2, 64, 200, 1)) < accepted
     assert adapted(np.cumsum(moved, axis=1).astype(float)) == made
+
+
+def test_proposals_are_not_adapted_to_too_few_draws(
+    joint: bf.JointPosterior, estimate: bf.MapEstimate
+) -> None:
+    """Eight walkers that never move spread in no more than eight directions."""
+    walkers = np.random.RandomState(1).multivariate_normal(
+        estimate.params, estimate.covariance, size=(2, 1, 4)
+    )
+    chain = np.repeat(walkers, 8, axis=1)
+    assert adapted(chain) == 8 < joint.n_parameters
+    (move, share), *_ = moves_after(joint, estimate, chain)
+    plain = FrameMove.of(joint, estimate, joint.log_parts)
+    assert share == 1.0 and isinstance(move, FrameMove)
+    np.testing.assert_array_equal(move.shared.lowers, plain.shared.lowers)
 
 
 def test_nearly_normal_frames_are_drawn_together(

@@ -9,7 +9,7 @@ from test_model import LIMIT
 
 from bayesfred._typing import Floats
 from bayesfred.model.protocol import TargetDensity
-from bayesfred.optimize.estimate import MapEstimate
+from bayesfred.optimize.estimate import MapEstimate, Modes
 from bayesfred.sampling.moves import LaplaceMove, funnel_of, moments
 from bayesfred.sampling.normal_scores import NormalScores, log_slopes, to_scores
 
@@ -145,3 +145,21 @@ def test_walkers_are_not_stuck_where_a_scale_is_small(shape: float) -> None:
     plain = LaplaceMove(x.mean(axis=0), np.cov(x.T), support=target.support)
     least = [np.quantile(accepted(move, target), 0.1) for move in (target.fitted, plain)]
     assert least[0] > 3.0 * least[1]
+
+
+def test_a_mode_of_few_draws_keeps_its_approximation() -> None:
+    """In the scores of the others' draws, where a scale of zero has none."""
+    target = Funnel(3.0)
+    draws = target.draws(4000)
+    mean, covariance = draws.mean(axis=0), np.diag(np.r_[0.01, np.full(DIMENSIONS, 0.2)])
+    far = np.r_[0.0, np.full(DIMENSIONS, 30.0)]
+    modes = Modes(np.array([mean, far]), np.array([covariance, covariance]), np.full(2, 0.5), 2)
+    estimate = MapEstimate(mean, covariance, 0.0, 1, "", True, True, modes)
+    move = LaplaceMove.fitted(target, estimate, draws)
+    x = move.draw(400_000, np.random.RandomState(2))
+    x = x[x[:, 1] > 15.0]
+    assert len(x) > 50
+    assert np.quantile(x[:, 0], 0.5) == pytest.approx(0.1, rel=0.3)
+    low, middle, high = np.quantile(x[:, 1], [0.16, 0.5, 0.84])
+    assert middle == pytest.approx(30.0, abs=0.3)
+    assert 0.5 * (high - low) == pytest.approx(np.sqrt(0.2), rel=0.5)

@@ -243,13 +243,14 @@ def moves_after(
     draws = chain[:, made // 2 : made].reshape(-1, chain.shape[3])
     if isinstance(posterior, JointPosterior):
         parts = log_parts or posterior.log_parts
-        if made:
-            return [(FrameMove.fitted(posterior, draws, parts), 1.0)]
+        with suppress(InputError):  # of too few draws: the next look has more
+            if made:
+                return [(FrameMove.fitted(posterior, draws, parts), 1.0)]
         return [(FrameMove.of(posterior, estimate, parts), 1.0)]
     move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= min(LOOKS))
     if made:
         share = DE_SHARE_ADAPTED
-        with suppress(InputError):  # of too few draws: the next look has more
+        with suppress(InputError):
             move = LaplaceMove.fitted(posterior, estimate, draws)
     return [(move, 1.0 - share), (emcee.moves.DEMove(live_dangerously=True), share)]
 

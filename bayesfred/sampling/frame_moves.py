@@ -101,7 +101,8 @@ class FrameMove(Move):  # type: ignore[misc]
             given -= slopes @ cross.T + cross @ slopes.T
             own, funnel = (mean[part.own], given), np.zeros(part.own.size)
             scales = np.flatnonzero(posterior.scales[part.own]).tolist()
-            if draws is not None and scales and len(draws) > 2 * part.own.size:
+            enough = draws is not None and len(draws) > 2 * part.own.size
+            if draws is not None and enough and 0 < len(scales) < part.own.size:
                 residuals = draws[:, part.own] - (draws[:, :p] - self.centre) @ slopes.T
                 funnel[scales] = funnel_of(residuals, scales)
                 own = moments(residuals, funnel)
@@ -110,8 +111,8 @@ class FrameMove(Move):  # type: ignore[misc]
         self.kept: dict[bytes, Floats] = {}
         self.mean, self.funnel = mean, np.zeros(mean.size)
         columns = np.flatnonzero(posterior.scales)
-        bounded, enough = len(self.shared.bounds) > 0, DRAWS_A_SCALE * columns.size
-        if draws is not None and not bounded and 0 < enough < len(draws):
+        bounded, needed = len(self.shared.bounds) > 0, DRAWS_A_SCALE * columns.size
+        if draws is not None and not bounded and 0 < needed < len(draws):
             both = draws[:, np.r_[:p, columns]]
             self.funnel[columns] = funnel_of(both, range(p, both.shape[1]))
         self.together = self._together()

@@ -168,17 +168,17 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
             If the draws spread in too few directions.
         """
         modes, d = estimate.mixture, draws.shape[1]
-        means, covariances = modes.means.copy(), modes.covariances.copy()
-        own, number = modes.assign(draws), np.ones(len(means))
-        scores = {
-            k: NormalScores.of_draws(draws[:, k])
-            for k, name in enumerate(posterior.parameter_names)
-            if name in SCALES
-        }
+        columns = [k for k, name in enumerate(posterior.parameter_names) if name in SCALES]
+        scores = {k: NormalScores.of_draws(draws[:, k]) for k in columns}
         y, support = to_scores(draws, scores), np.array(posterior.support)
-        support[:, list(scores)] = [[-np.inf], [np.inf]]
-        funnel, columns = np.zeros(d), list(scores)
-        if columns and len(y) > 2 * d:
+        support[:, columns] = [[-np.inf], [np.inf]]
+        means, sds = modes.means.copy(), np.sqrt(np.diagonal(modes.covariances, axis1=1, axis2=2))
+        means[:, columns] = np.maximum(means, sds)[:, columns]  # a scale may be at zero
+        means = to_scores(means, scores)
+        units = np.exp(log_slopes(means, scores))
+        covariances = modes.covariances / (units[:, :, None] * units[:, None, :])
+        own, number, funnel = modes.assign(draws), np.ones(len(means)), np.zeros(d)
+        if 0 < len(columns) < d and len(y) > 2 * d:
             funnel[columns] = funnel_of(y, columns)
         for k in range(len(means)):
             some = y[own == k]
@@ -266,13 +266,21 @@ def funnel_of(draws: Floats, scales: Sequence[int]) -> Floats:
     Returns
     -------
     ndarray, shape (scales,)
-        The growth of the logarithm of the others' mean distance from their mean, that of normal
-        distributions with the same covariance being 1.
+        By how much the logarithm of the others' distance from their mean grows with each.
+
+    Raises
+    ------
+    InputError
+        If the draws spread in too few directions.
     """
     of = np.column_stack([np.ones(len(draws)), draws[:, scales] - draws[:, scales].mean(axis=0)])
     others = np.delete(draws, scales, axis=1)
     left = others - of @ np.linalg.lstsq(of, others)[0]
-    z = solve_triangular(cholesky(np.cov(left.T, ddof=0), lower=True), left.T, lower=True)
+    try:
+        lower = cholesky(np.atleast_2d(np.cov(left.T, ddof=0)), lower=True)
+    except LinAlgError:
+        raise InputError("draws: got too few, expected them to spread in all directions") from None
+    z = solve_triangular(lower, left.T, lower=True)
     return np.asarray(np.linalg.lstsq(of, 0.5 * np.log((z**2).mean(axis=0)))[0][1:])
 
 
