@@ -161,7 +161,10 @@ def test_scores_are_those_of_dense_algebra() -> None:
     )
 
 
-@pytest.mark.parametrize("noise", [PoissonNoise(2.0), PoissonNoise(np.full((65, 65), 0.7))])
+@pytest.mark.parametrize(
+    "noise",
+    [PoissonNoise(2.0), pytest.param(PoissonNoise(np.full((65, 65), 0.7)), marks=pytest.mark.slow)],
+)
 def test_a_frame_is_shared_by_models_of_other_backgrounds(noise: PoissonNoise) -> None:
     """A likelihood is what it is when all is made for it, also of a background that varies."""
     sources = SourceCatalog.grid(3, 17.0, 1e3)

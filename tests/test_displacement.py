@@ -354,7 +354,9 @@ def test_the_error_of_bright_sources_goes_with_the_root_and_of_faint_ones_with_t
     [
         bf.Nuisances("scale", offset=True, psf_sigma=True, background_order=1),
         bf.Nuisances("free"),
-        bf.Nuisances("free", position_scatter=True),
+        pytest.param(
+            bf.Nuisances("free", position_scatter=True), id="scatter", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_what_is_needed_gives_the_error_that_was_asked_for(nuisances: bf.Nuisances) -> None:

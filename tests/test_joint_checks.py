@@ -277,6 +277,7 @@ def test_one_frame_is_judged_as_a_joint_posterior_as_alone(kind: str) -> None:
     assert found.displacement_rms == pytest.approx(alone.displacement_rms, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_frames_that_share_nothing_of_the_lens_are_judged_as_alone() -> None:
     """They share a background that is known; their coefficients are all there is to compare."""
     known = {"background": stats.norm(LEVEL, 1e-4)}

@@ -64,6 +64,7 @@ def test_a_ghost_beside_a_source_runs_away_with_nothing(
     assert estimate.fits_data == (width < 3.0)
 
 
+@pytest.mark.slow
 def test_a_source_that_shows_its_wings_alone_is_masked_with_a_model_error():
     """Else its flux grows until its error covers what is wrong there."""
     posterior = frame_with_ghosts(1, 1.0, 2.5)  # of a photon
