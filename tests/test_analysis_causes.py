@@ -50,9 +50,10 @@ def named_first(name: str, seeds: range) -> int:
     return hits
 
 
+@pytest.mark.parametrize("seed", [101, pytest.param(102, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", planted.FAULTS)
-def test_planted_fault_is_named_first(name: str) -> None:
-    assert named_first(name, range(101, 103)) == 2
+def test_planted_fault_is_named_first(name: str, seed: int) -> None:
+    assert named_first(name, range(seed, seed + 1)) == 1
 
 
 @pytest.mark.statistics
