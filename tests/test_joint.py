@@ -409,7 +409,10 @@ def test_proposals_are_adapted_early_for_little(accepted: float, made: int) -> N
     """Before step 32 where half of the moves are refused, later where most are."""
     random = np.random.default_rng(1)
     moved = random.random((2, 64, 200, 1)) < accepted
-    assert adapted(np.cumsum(moved, axis=1).astype(float)) == made
+    chain = np.cumsum(moved, axis=1).astype(float)
+    assert adapted(chain) == made
+    many = np.repeat(chain, 81, axis=3)  # of which 6,400 draws do not tell the covariance
+    assert adapted(many) == (made if accepted < 0.3 else 0)
 
 
 def test_proposals_are_not_adapted_to_too_few_draws(

@@ -30,9 +30,10 @@ from bayesfred.sampling.frame_moves import FrameMove, Parts
 from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
-# Steps after which proposals are adapted if fewer than this share of moves were accepted in the
-# latter half of them. The draws until then are left out: later there has to be more to gain.
-LOOKS = {8: 0.5, 16: 0.5, 32: 0.5, 64: 0.3, 128: 0.3, 256: 0.3}
+# Share of accepted moves below which proposals are adapted. Early it costs few draws, which have to
+# be as many as covariances of d parameters need, d^2.
+POOR, POOR_EARLY, EARLY = 0.3, 0.5, 32
+LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which this is checked, over the latter half of them
 DE_SHARE_ADAPTED = 0.2  # ... where proposals had to be adapted
 STUCK = 1000  # proposals refused in a row, to one walker or to a whole ensemble, that end a run
 # share of the largest spread, in standard deviations, below which there is none in a direction
@@ -204,12 +205,15 @@ def adapted(chain: Floats) -> int:
     ----------
     chain : ndarray, shape (ensembles, steps, walkers, d)
     """
-    looks = [
-        look
-        for look, poor in LOOKS.items()
-        if look <= chain.shape[1] and _accepted(chain, look) < poor
-    ]
+    looks = [look for look in LOOKS if look <= chain.shape[1] and _poor(chain, look)]
     return max(looks, default=0)
+
+
+def _poor(chain: Floats, look: int) -> bool:
+    """Whether too few moves are accepted before a look."""
+    ensembles, _, walkers, d = chain.shape
+    early = look <= EARLY and ensembles * walkers * (look - look // 2) >= d**2
+    return _accepted(chain, look) < (POOR_EARLY if early else POOR)
 
 
 def _accepted(chain: Floats, look: int) -> float:
@@ -247,7 +251,7 @@ def moves_after(
             if made:
                 return [(FrameMove.fitted(posterior, draws, parts), 1.0)]
         return [(FrameMove.of(posterior, estimate, parts), 1.0)]
-    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= min(LOOKS))
+    move, share = LaplaceMove.of(posterior, estimate), DE_SHARE * (chain.shape[1] >= LOOKS[0])
     if made:
         share = DE_SHARE_ADAPTED
         with suppress(InputError):
