@@ -55,7 +55,7 @@ def test_another_lens_is_found_where_positions_scatter() -> None:
 
 @pytest.mark.slow
 def test_a_run_whose_proposals_adapt_is_resumed_bit_by_bit(tmp_path: Path) -> None:
-    """Scales go by their logarithms within a step, which must leave nothing behind."""
+    """Scales go by their scores within a step, which must leave nothing behind."""
     joint = together(1, 0.0, 0.0, sources=16)
     best, path = bf.find_map(joint), tmp_path / "run.h5"
     bf.sample(joint, best, seed=2, path=path, steps=12, progress=False)

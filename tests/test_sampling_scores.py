@@ -67,6 +67,7 @@ SCORES = [
 def test_values_have_their_scores_and_slopes(scores: NormalScores) -> None:
     z = np.linspace(-8.0, 8.0, 123)
     assert scores.at(scores.values(z)) == pytest.approx(z, abs=1e-9)
+    assert np.all(scores.values(np.array([-60.0, 60.0])) > 0.0)  # no double underflows
     z = z[np.abs(z[:, None] - scores.scores).min(axis=1) > 1e-3]  # slopes have steps at the knots
     h = 1e-6
     slope = np.log((scores.values(z + h) - scores.values(z - h)) / (2.0 * h))

@@ -101,8 +101,7 @@ class FrameMove(Move):  # type: ignore[misc]
             given -= slopes @ cross.T + cross @ slopes.T
             own, funnel = (mean[part.own], given), np.zeros(part.own.size)
             scales = np.flatnonzero(posterior.scales[part.own]).tolist()
-            enough = draws is not None and len(draws) > 2 * part.own.size
-            if draws is not None and enough and 0 < len(scales) < part.own.size:
+            if draws is not None and 0 < len(scales) < part.own.size:
                 residuals = draws[:, part.own] - (draws[:, :p] - self.centre) @ slopes.T
                 funnel[scales] = funnel_of(residuals, scales)
                 own = moments(residuals, funnel)

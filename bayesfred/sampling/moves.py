@@ -178,7 +178,7 @@ class LaplaceMove(RedBlueMove):  # type: ignore[misc]
         units = np.exp(log_slopes(means, scores))
         covariances = modes.covariances / (units[:, :, None] * units[:, None, :])
         own, number, funnel = modes.assign(draws), np.ones(len(means)), np.zeros(d)
-        if 0 < len(columns) < d and len(y) > 2 * d:
+        if 0 < len(columns) < d:
             funnel[columns] = funnel_of(y, columns)
         for k in range(len(means)):
             some = y[own == k]

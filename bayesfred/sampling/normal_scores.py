@@ -20,7 +20,7 @@ from scipy.special import log_ndtr, ndtri, ndtri_exp
 from bayesfred._typing import Floats
 
 SHARES = (0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # of the draws below the knots
-LARGEST = 300.0  # logarithm of a scale
+LARGEST = 300.0  # logarithm of a scale, or of its inverse
 
 
 class NormalScores(NamedTuple):
@@ -70,12 +70,15 @@ class NormalScores(NamedTuple):
 
     def values(self, z: Floats) -> Floats:
         """The values of scores."""
+        return np.asarray(np.exp(self._logs(z)))
+
+    def _logs(self, z: Floats) -> Floats:
         first, last = self.scores[0], self.scores[-1]
         low = self.logs[0] + (log_ndtr(z) - log_ndtr(first)) / self.low
         high = self.logs[-1] - (log_ndtr(-z) - log_ndtr(-last)) / self.high
         logs = np.interp(z, self.scores, self.logs)
         logs = np.where(z < first, low, np.where(z > last, high, logs))
-        return np.asarray(np.exp(np.minimum(logs, LARGEST)))
+        return np.clip(logs, -LARGEST, LARGEST)
 
     def log_slope(self, z: Floats) -> Floats:
         """Logarithm of the derivative of values by scores."""
@@ -84,7 +87,7 @@ class NormalScores(NamedTuple):
         low, high = _log_hazard(-z) - np.log(self.low), _log_hazard(z) - np.log(self.high)
         outer = np.where(z < self.scores[0], low, high)
         inside = (z >= self.scores[0]) & (z <= self.scores[-1])
-        return np.log(self.values(z)) + np.where(inside, between, outer)
+        return self._logs(z) + np.where(inside, between, outer)
 
 
 Scores = Mapping[int, NormalScores]  # of some parameters, by their place
