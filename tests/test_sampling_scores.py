@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import log_ndtr
 from test_model import LIMIT
 
 from bayesfred._typing import Floats
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, Modes
-from bayesfred.sampling.moves import LaplaceMove, funnel_of, moments
+from bayesfred.sampling.moves import DEGREES_OF_FREEDOM, LaplaceMove, funnel_of, moments
 from bayesfred.sampling.normal_scores import NormalScores, log_slopes, to_scores
 
 DIMENSIONS = 8  # besides the scale, of the funnel
@@ -72,6 +73,19 @@ def test_values_have_their_scores_and_slopes(scores: NormalScores) -> None:
     h = 1e-6
     slope = np.log((scores.values(z + h) - scores.values(z - h)) / (2.0 * h))
     assert scores.log_slope(z) == pytest.approx(slope, abs=1e-7)
+
+
+@pytest.mark.parametrize("scores", SCORES)
+def test_no_score_is_of_an_enormous_value(scores: NormalScores) -> None:
+    """Likelihoods of a scatter as wide as the frame take minutes; a heavy tail would propose them.
+
+    One in 10^6 draws of Student's distribution is above z. There the tail of a power would be at
+    more than 10^9 of the last knot, that of a log-normal distribution at 10^8 of the first case's.
+    """
+    z = np.array([stats.t.isf(1e-6, DEGREES_OF_FREEDOM)])
+    assert scores.values(z) < 150.0 * np.exp(scores.logs[-1])
+    powers = (log_ndtr(-scores.scores[-1]) - log_ndtr(-z)) / scores.high
+    assert np.exp(powers) > 1e9
 
 
 def test_scores_of_draws_are_normal() -> None:

@@ -2,13 +2,17 @@
 
 A scale, such as the scatter of a frame's positions, is known to a factor at best where sources are
 few. No normal distribution, of it or of its logarithm, is near its posterior. Between knots, which
-are quantiles, log s is interpolated linearly in z. Beyond them the tails are those of powers,
+are quantiles, log s is interpolated linearly in z. Beyond them the tails are a power's and an
+exponential one,
 
-    Phi(z) = Phi(z_1) (s / s_1)^a,        Phi(-z) = Phi(-z_n) (s / s_n)^-b,
+    Phi(z) = Phi(z_1) (s / s_1)^a,        Phi(-z) = Phi(-z_n) exp(b (1 - s / s_n)),
 
 with a and b such that the density is continuous at the knots, and a at most 1. That is the power of
-a density that is finite at s = 0, as where the counts do not tell a scale from zero. So proposals
-made by normal scores are nowhere much rarer than the posterior's draws: there walkers would stick.
+a density that is finite at s = 0, as where the counts do not tell a scale from zero; the upper tail
+is that of the default priors. So proposals made by normal scores are nowhere much rarer than the
+posterior's draws: there walkers would stick. Nor are they far above them: with the tail of a power
+scores of Student's distribution reach scales of many times a frame's width, whose likelihoods take
+minutes.
 """
 
 from collections.abc import Mapping
@@ -20,7 +24,7 @@ from scipy.special import log_ndtr, ndtri, ndtri_exp
 from bayesfred._typing import Floats
 
 SHARES = (0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # of the draws below the knots
-LARGEST = 300.0  # logarithm of a scale, or of its inverse
+LEAST = -300.0  # logarithm of a scale
 
 
 class NormalScores(NamedTuple):
@@ -33,7 +37,7 @@ class NormalScores(NamedTuple):
     scores : ndarray, shape (n,)
         Their scores.
     low, high : float
-        The powers a and b.
+        a and b.
     """
 
     logs: Floats
@@ -63,7 +67,8 @@ class NormalScores(NamedTuple):
         """The scores of values."""
         logs = np.log(values)
         low = log_ndtr(self.scores[0]) + self.low * np.minimum(logs - self.logs[0], 0.0)
-        high = log_ndtr(-self.scores[-1]) - self.high * np.maximum(logs - self.logs[-1], 0.0)
+        above = np.expm1(np.maximum(logs - self.logs[-1], 0.0))
+        high = log_ndtr(-self.scores[-1]) - self.high * above
         z = np.interp(logs, self.logs, self.scores)
         outer = np.where(logs < self.logs[0], ndtri_exp(low), -ndtri_exp(high))
         return np.where((logs < self.logs[0]) | (logs > self.logs[-1]), outer, z)
@@ -75,16 +80,21 @@ class NormalScores(NamedTuple):
     def _logs(self, z: Floats) -> Floats:
         first, last = self.scores[0], self.scores[-1]
         low = self.logs[0] + (log_ndtr(z) - log_ndtr(first)) / self.low
-        high = self.logs[-1] - (log_ndtr(-z) - log_ndtr(-last)) / self.high
+        high = self.logs[-1] + np.log1p(self._above(z))
         logs = np.interp(z, self.scores, self.logs)
-        logs = np.where(z < first, low, np.where(z > last, high, logs))
-        return np.clip(logs, -LARGEST, LARGEST)
+        return np.where(z < first, np.maximum(low, LEAST), np.where(z > last, high, logs))
+
+    def _above(self, z: Floats) -> Floats:
+        """s / s_n - 1 above the last knot."""
+        last = self.scores[-1]
+        return np.asarray((log_ndtr(-last) - log_ndtr(-np.maximum(z, last))) / self.high)
 
     def log_slope(self, z: Floats) -> Floats:
         """Logarithm of the derivative of values by scores."""
         widths = np.log(np.diff(self.logs) / np.diff(self.scores))
         between = widths[np.clip(np.searchsorted(self.scores, z) - 1, 0, widths.size - 1)]
-        low, high = _log_hazard(-z) - np.log(self.low), _log_hazard(z) - np.log(self.high)
+        low = _log_hazard(-z) - np.log(self.low)
+        high = _log_hazard(z) - np.log(self.high) - np.log1p(self._above(z))
         outer = np.where(z < self.scores[0], low, high)
         inside = (z >= self.scores[0]) & (z <= self.scores[-1])
         return self._logs(z) + np.where(inside, between, outer)
