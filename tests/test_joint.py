@@ -413,7 +413,8 @@ def test_proposals_are_adapted_early_for_little(accepted: float, made: int) -> N
     moved = random.random((2, 64, 200, 1)) < accepted
     chain = np.cumsum(moved, axis=1).astype(float)
     assert adapted(chain) == made
-    many = np.repeat(chain, 81, axis=3)  # of which 6,400 draws do not tell the covariance
+    assert adapted(np.repeat(chain, 100, axis=3)) == made
+    many = np.repeat(chain, 257, axis=3)  # of which 6,400 draws do not tell the covariance
     assert adapted(many) == (made if accepted < 0.3 else 0)
 
 

@@ -7,12 +7,12 @@ exponential one,
 
     Phi(z) = Phi(z_1) (s / s_1)^a,        Phi(-z) = Phi(-z_n) exp(b (1 - s / s_n)),
 
-with a and b such that the density is continuous at the knots, and a at most 1. That is the power of
-a density that is finite at s = 0, as where the counts do not tell a scale from zero; the upper tail
-is that of the default priors. So proposals made by normal scores are nowhere much rarer than the
-posterior's draws: there walkers would stick. Nor are they far above them: with the tail of a power
-scores of Student's distribution reach scales of many times a frame's width, whose likelihoods take
-minutes.
+with a and b such that the density is continuous at the knots, but a at most 1 where it would be
+below 2. That is the power of a density that is finite at s = 0, as where the counts hardly tell a
+scale from zero; the upper tail is that of the default priors. So proposals made by normal scores
+are nowhere much rarer than the posterior's draws: there walkers would stick. Nor are they far above
+them: with the tail of a power, scores of Student's distribution reach scales of many times a
+frame's width, whose likelihoods take minutes.
 """
 
 from collections.abc import Mapping
@@ -25,6 +25,7 @@ from bayesfred._typing import Floats
 
 SHARES = (0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # of the draws below the knots
 LEAST = -300.0  # logarithm of a scale
+AWAY = 2.0  # a of a scale that is told from zero
 
 
 class NormalScores(NamedTuple):
@@ -49,7 +50,8 @@ class NormalScores(NamedTuple):
     def through(cls, logs: Floats, scores: Floats) -> "NormalScores":
         """Those with these knots."""
         slopes, hazards = np.diff(scores) / np.diff(logs), np.exp(_log_hazard(np.abs(scores)))
-        return cls(logs, scores, min(hazards[0] * slopes[0], 1.0), hazards[-1] * slopes[-1])
+        low = hazards[0] * slopes[0]
+        return cls(logs, scores, low if low > AWAY else min(low, 1.0), hazards[-1] * slopes[-1])
 
     @classmethod
     def log_normal(cls, median: float, sd: float) -> "NormalScores":
