@@ -205,9 +205,8 @@ class FrameMove(Move):  # type: ignore[misc]
         parts = self._parts_at(before)
 
         def values(y: Floats) -> Floats:
-            return np.where(
-                y == first, before, to_values(y, self.scores)
-            )  # what stays, to the last bit
+            stays = y == first  # to the last bit
+            return np.where(stays, before, to_values(y, self.scores))
 
         new, factor = self._drawn(y, random)
         for i in np.flatnonzero(self.together).tolist():
