@@ -30,8 +30,8 @@ from bayesfred.sampling.frame_moves import FrameMove, Parts
 from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
-# Share of accepted moves below which proposals are adapted. Early it costs few draws, which have to
-# be as many as covariances of d parameters need: d^2, of several frames' blocks at most 25 d.
+# Share of accepted moves below which proposals are adapted. Early it costs few draws, but they have
+# to be enough for a covariance.
 POOR, POOR_EARLY, EARLY, DRAWS_A_PARAMETER = 0.3, 0.5, 32, 25
 LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which this is checked, over the latter half of them
 DE_SHARE_ADAPTED = 0.2  # ... where proposals had to be adapted
@@ -213,7 +213,7 @@ def _poor(chain: Floats, look: int) -> bool:
     """Whether too few moves are accepted before a look."""
     ensembles, _, walkers, d = chain.shape
     draws = ensembles * walkers * (look - look // 2)
-    early = look <= EARLY and draws >= min(d, DRAWS_A_PARAMETER) * d
+    early = look <= EARLY and draws >= DRAWS_A_PARAMETER * d
     return _accepted(chain, look) < (POOR_EARLY if early else POOR)
 
 
