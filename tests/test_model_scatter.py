@@ -301,6 +301,31 @@ def test_of_two_modes_of_a_shift_the_higher_counts() -> None:
     assert min(gains) < -1.0 and max(gains) > 1.0
 
 
+@pytest.mark.parametrize("binning", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_images_are_found_where_positions_are_off_by_more_than_the_psf_is_wide(
+    binning: int,
+) -> None:
+    """Newton's steps from the catalogue's positions end elsewhere: the images are looked for.
+
+    The faint source of three is nearest to where the catalogue has the bright one, and its own
+    image is in the bright one's wings.
+    """
+    detector, flux = Detector((48, 64), binning), [3e4, 3e3, 6e3]
+    places = np.array([[-12.0, -5.0], [-7.0, -5.0], [14.0, 4.0]]) * binning
+    catalogue = SourceCatalog(*places.T, flux)
+    model = make_model(catalogue, sigma=0.8 * binning, detector=detector)
+    rng, tau = np.random.default_rng(54), 2.0 * binning
+    named = known({**make_truth(model, rng, 30.0), "position_scatter": tau}, SCATTER)
+    shifts = np.array([[-3.0, 4.0], [-6.5, 3.0], [4.0, -3.5]]) * binning
+    images = [f * shifted_image(model, named, s, shifts[s]) for s, f in enumerate(flux)]
+    mean = np.sum(images, axis=0) + background_image(detector.shape, named)
+    posterior = Posterior(model, rng.poisson(mean), nuisances=SCATTER)
+    params = np.array([named[name] for name in posterior.parameter_names])
+    expected = mode(posterior, params, shifts.ravel()).log_likelihood
+    value = posterior.log_prob(params) - posterior.log_prior(params)[0]
+    assert value == pytest.approx(expected, abs=0.01)
+
+
 def test_scatter_is_outside_the_support_below_zero_and_needs_free_fluxes() -> None:
     model = three(4e3)
     rng = np.random.default_rng(52)

@@ -16,7 +16,6 @@ Symbols are those of `fluxes.py`. The pixels of a cluster are visited as seldom 
 Where that does not converge, Newton's steps with H in full do, see `fluxes.py`.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -34,8 +33,6 @@ from bayesfred.model.kernels.noise_dispatch import given
 from bayesfred.model.kernels.patches import Patch, weigh_patch
 
 BAND = 64  # rows that are visited at a time: their templates stay in the caches
-FIRST_ROWS = 32  # of a source, which its first flux is fitted to
-SEEN = 0.01  # of the sum of K^2 over its pixels, at the least, for that
 ROWS = 8  # of those that two sources share, which a first look at their overlap visits
 FAR = 1e-5  # overlap of two sources, as a correlation, whose square is lost in rounding
 PROJECT, ROUGH, FULL = 0, 1, 2  # kinds of visits
@@ -76,53 +73,6 @@ def make_templates(cluster, s, flux):
 def _add_three(layout, s, flux, stamps, scatters):
     if scatters is not None:
         add_templates(layout, s, flux, stamps, None)
-
-
-@leaf(fastmath=REDUCE)
-def _least_squares(cluster, s):
-    """Sums over some of a source's rows: K times counts above the background, K^2, and K^2 of all.
-
-    The last has the pixels, too, that are not in the likelihood.
-    """
-    fp, stamp, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
-    values, weights, starts, sizes = cluster.patch.score, cluster.patch.weight, fp.start, fp.size
-    above, below, every = 0.0, 0.0, 0.0
-    step = max((fp.first[s + 1] - fp.first[s]) // FIRST_ROWS, 1)
-    for p in range(fp.first[s] + step // 2, fp.first[s + 1], step):
-        i, j = U(starts[p]), U(at[p])
-        for k in range(U(sizes[p])):
-            square = stamp[i + k] * stamp[i + k]
-            above += stamp[i + k] * values[j + k]
-            below += square * weights[j + k]
-            every += square
-    return step * above, step * below, step * every
-
-
-@leaf()
-def start(cluster, level):
-    """Templates, and the most likely flux of every source, its neighbours ignored.
-
-    Counts are taken to have the variance of the background level, so that log L + log p is
-
-        F A - F^2 B / 2 + a log F - F / c,
-
-    whose maximum is positive. A source of which hardly more is seen than its neighbours' light in
-    its wings begins at the prior's maximum.
-    """
-    fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
-    for s in cluster.group.members:
-        make_templates(cluster, s, 1.0)
-        above, below, every = _least_squares(cluster, s)
-        fluxes[s] = cluster.prior.shape * cluster.scale[s]
-        if below > SEEN * every:
-            slope, known = above / level - 1.0 / cluster.scale[s], below / level
-            root = math.sqrt(slope * slope + 4.0 * cluster.prior.shape * known)
-            more = 0.5 * (abs(slope) + root)
-            fluxes[s] = more / known if slope > 0.0 else cluster.prior.shape / more
-        for m in range(1, stamps.shape[0]):
-            for i in range(fp.start[fp.first[s]], fp.start[fp.first[s + 1]]):
-                stamps[m, i] *= fluxes[s]
-        _add_step(cluster, (fp.first[s], fp.first[s + 1]), fluxes[s])
 
 
 @inner()

@@ -49,12 +49,12 @@ from bayesfred.model.kernels.flux_newton import (
     Cluster,
     make_templates,
     maximize_fluxes,
-    start,
 )
 from bayesfred.model.kernels.noise_dispatch import by_exactness, given
 from bayesfred.model.kernels.patches import add_patch, fill_excess, new_patch, weigh_patch
 from bayesfred.model.kernels.shift_modes import other_mode
 from bayesfred.model.kernels.shift_newton import change_source, log_density, log_prior, maximize
+from bayesfred.model.kernels.starts import start
 
 TRIES = 4  # other modes that are looked at in a cluster
 TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
@@ -192,7 +192,7 @@ def profile(problem, layout, w, parameters, known, profiled):
             _resume(cluster, known.start)
         else:
             fill_excess(problem.frame, parameters.background, patch)
-            start(cluster, max(parameters.background[0], 1.0))
+            start(cluster, parameters)
         gain = _highest(problem, parameters, cluster, known, h, touching.scatters)
         if math.isnan(gain):
             return math.nan if known.nearby.e.size > 0 else -math.inf
