@@ -110,7 +110,7 @@ SOUND: dict[str, dict[str, SearchStrategy[Any]]] = {
         "flux": st.sampled_from(["fixed", "scale", "free"]),
         "offset": st.booleans(),
         "psf_sigma": st.booleans(),
-        "background_order": st.sampled_from([0, 1, 2]),
+        "background_order": st.sampled_from([0, 1, 2, 4]),
         "footprint": st.floats(0.1, 100),
     },
     "prior": dict.fromkeys(("f_ux", "background", "flux_scale", "psf_sigma"), PRIOR),

@@ -408,14 +408,18 @@ def test_proposals_are_adapted_to_the_frame_that_moves_least() -> None:
 
 @pytest.mark.parametrize(("accepted", "made"), [(0.6, 0), (0.4, 32), (0.2, 64)])
 def test_proposals_are_adapted_early_for_little(accepted: float, made: int) -> None:
-    """Before step 32 where half of the moves are refused, later where most are."""
+    """Before step 32 where half of the moves are refused, later where most are.
+
+    Where draws before step 32 do not tell the covariance, the first that do count as early.
+    """
     random = np.random.default_rng(1)
     moved = random.random((2, 64, 200, 1)) < accepted
     chain = np.cumsum(moved, axis=1).astype(float)
     assert adapted(chain) == made
     assert adapted(np.repeat(chain, 100, axis=3)) == made
     many = np.repeat(chain, 257, axis=3)  # of which 6,400 draws do not tell the covariance
-    assert adapted(many) == (made if accepted < 0.3 else 0)
+    assert adapted(many[:, :63]) == (32 if accepted < 0.3 else 0)
+    assert adapted(many) == (0 if accepted > 0.5 else 64)
 
 
 def test_proposals_are_not_adapted_to_too_few_draws(

@@ -22,14 +22,14 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.fastmath import FAST, REDUCE, exp2, log, take_turn, wide_vectors
 from bayesfred.imaging.psf import GaussianPSF
 from bayesfred.model.noise import BackgroundNoise, PoissonNoise, simulate
-from bayesfred.model.parameters import Nuisances
+from bayesfred.model.parameters import BACKGROUND_TERMS, Nuisances
 from bayesfred.model.posterior import Posterior
 
 Floats = NDArray[np.float64]
 Noise = PoissonNoise | BackgroundNoise
 
 MIRRORED = PolynomialDistortion.mirrored()
-EVERYTHING = Nuisances("scale", offset=True, psf_sigma=True, background_order=2)
+EVERYTHING = Nuisances("scale", offset=True, psf_sigma=True, background_order=4)
 LIMIT = 4.0  # Monte Carlo errors: exceeded by chance in 1 of 16,000
 
 
@@ -65,8 +65,10 @@ def make_truth(
     terms = (*model.distortion.f_terms, *model.distortion.g_terms)
     levers = [(nx / 2) ** (i + m) * (ny / 2) ** (j + n) for i, j, m, n in terms]
     theta = 0.5 * rng.standard_normal(len(levers)) / levers
-    slopes = background * rng.uniform(-0.15, 0.15, 5)
-    names = ("background_u", "background_v", "background_u2", "background_uv", "background_v2")
+    slopes = background * np.append(
+        rng.uniform(-0.15, 0.15, 5), np.random.default_rng(9).uniform(-0.05, 0.05, 9)
+    )
+    names = BACKGROUND_TERMS[1:]
     return {
         **dict(zip(model.distortion.names, theta, strict=True)),
         "background": background,
@@ -115,7 +117,11 @@ def background_image(shape: tuple[int, int], named: Mapping[str, float]) -> Floa
     ny, nx = shape
     u = oracles.middle_out(nx) * 2 / nx
     v = oracles.middle_out(ny)[:, None] * 2 / ny
-    powers = {"": 1, "_u": u, "_v": v, "_u2": u**2, "_uv": u * v, "_v2": v**2}
+    powers = {
+        "": 1, "_u": u, "_v": v, "_u2": u**2, "_uv": u * v, "_v2": v**2,
+        "_u3": u**3, "_u2v": u**2 * v, "_uv2": u * v**2, "_v3": v**3,
+        "_u4": u**4, "_u3v": u**3 * v, "_u2v2": u**2 * v**2, "_uv3": u * v**3, "_v4": v**4,
+    }  # fmt: skip
     terms = [
         named.get("background" + name, 0.0) * power * np.ones(shape)
         for name, power in powers.items()
@@ -569,7 +575,7 @@ def test_posterior_refuses_what_it_cannot_use(options: dict[str, Any], message: 
 
 @pytest.mark.parametrize(
     "choice",
-    [{"flux": "loose"}, {"background_order": 3}, {"footprint": 0.0}, {"footprint": math.nan}],
+    [{"flux": "loose"}, {"background_order": 5}, {"footprint": 0.0}, {"footprint": math.nan}],
 )
 def test_nuisances_are_checked(choice: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"nuisances: {next(iter(choice))}: got"):

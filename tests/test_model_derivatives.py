@@ -33,7 +33,7 @@ from bayesfred.model.posterior import Posterior
 Floats = NDArray[np.float64]
 
 FREE = Nuisances("free")
-FREE_AND_ALL = Nuisances("free", offset=True, psf_sigma=True, background_order=2)
+FREE_AND_ALL = Nuisances("free", offset=True, psf_sigma=True, background_order=4)
 # of a parameter's error, the others fixed: what the five-point rule leaves out is STEP^4 / 30 =
 # 5e-9 of it
 STEP = 0.02
@@ -78,7 +78,7 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
     "offset": (overlapping(), Nuisances(offset=True), PoissonNoise(), 3.0),
     "psf": (overlapping(), Nuisances(psf_sigma=True), PoissonNoise(), 3.0),
     "slopes": (overlapping(), Nuisances(background_order=1), PoissonNoise(), 3.0),
-    "curved": (isolated(), Nuisances(background_order=2), PoissonNoise(), 3.0),
+    "curved": (isolated(), Nuisances(background_order=4), PoissonNoise(), 3.0),
     "everything": (overlapping(), EVERYTHING, PoissonNoise(1.5), 3.0),
     "paper": (
         overlapping(),
@@ -89,7 +89,7 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, Noise, float]] = {
     "gaussian": (isolated(), Nuisances("scale", psf_sigma=True), GaussianNoise(20.0), 3.0),
     "gaussian, curved": (
         isolated(),
-        Nuisances("scale", background_order=2),
+        Nuisances("scale", background_order=3),
         GaussianNoise(20.0),
         3.0,
     ),

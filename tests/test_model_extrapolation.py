@@ -44,7 +44,7 @@ CASES: dict[str, tuple[ForwardModel, Nuisances, PoissonNoise]] = {
     ),
     "nuisances": (
         make_model(TOUCHING, tolerance=1e-8),
-        Nuisances("free", offset=True, background_order=2),
+        Nuisances("free", offset=True, background_order=4),
         PoissonNoise(1.5),
     ),
     "box": (

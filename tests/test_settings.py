@@ -347,8 +347,8 @@ def test_settings_are_frozen(tmp_path: Path) -> None:
         ),
         (
             "nuisances",
-            "background_order = 3",
-            "nuisances.background_order: got 3, expected 0, 1 or 2",
+            "background_order = 5",
+            "nuisances.background_order: got 5, expected an integer from 0 to 4",
         ),
         (
             "nuisances",

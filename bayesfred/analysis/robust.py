@@ -42,8 +42,9 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.absorbed import absorbed, responses
 from bayesfred.analysis.folds import fold_sources
 from bayesfred.analysis.sources import SourceFits, fit_sources
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS
 from bayesfred.model.kernels.fisher import EXPECTED
-from bayesfred.model.parameters import BACKGROUND_POWERS, SCALES
+from bayesfred.model.parameters import SCALES
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import inverse
 
@@ -96,7 +97,7 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     light = _by_pixel(fits, owner.size)[order]
     names = posterior.nuisances.background_names
     level_moves = root[[posterior.parameter_names.index(name) for name in names]]
-    level_terms = _background_terms(np.unravel_index(order, shape), shape)[:, : len(names)]
+    level_terms = _background_terms(np.unravel_index(order, shape), shape, len(names))
     scores = np.empty((len(ends), params.size))
     for k, (first, last) in enumerate(itertools.pairwise([0, *ends.tolist()])):
         own = slice(first, last)
@@ -116,7 +117,7 @@ def _by_pixel(fits: SourceFits, pixels: int) -> sparse.csr_matrix:
     return sparse.hstack(list(each)).tocsr()
 
 
-def _background_terms(pixels: tuple[Ints, ...], shape: tuple[int, ...]) -> Floats:
-    """The background polynomial's terms at some pixels, shape (n, 6)."""
+def _background_terms(pixels: tuple[Ints, ...], shape: tuple[int, ...], terms: int) -> Floats:
+    """The background polynomial's terms at some pixels, shape (n, terms)."""
     v, u = ((2.0 * index - (n - 1)) / n for index, n in zip(pixels, shape, strict=True))
-    return np.stack([u**m * v**n for m, n in BACKGROUND_POWERS], axis=1)
+    return np.stack([u**m * v**n for m, n in BACKGROUND_POWERS[:terms]], axis=1)

@@ -246,13 +246,13 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
 
 
 def _largest_order(posterior: Posterior) -> int:
-    """Two, or the model's own order where the noise admits no other."""
-    noise, flux = posterior.noise, posterior.nuisances.flux
+    """Two or the model's own order, if that is more or the noise admits no other."""
+    noise, own = posterior.noise, posterior.nuisances.background_order
     try:
-        noise.check(posterior.counts, posterior.mask, flux, 2)
+        noise.check(posterior.counts, posterior.mask, posterior.nuisances.flux, 2)
     except InputError:
-        return posterior.nuisances.background_order
-    return 2
+        return own
+    return max(own, 2)
 
 
 def _with_more_terms(distortion: PolynomialDistortion) -> PolynomialDistortion:

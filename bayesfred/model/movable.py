@@ -29,9 +29,10 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.inverse import slopes
 from bayesfred.imaging.kernels.contexts import Basis
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS
 from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.likelihood import FrameLikelihood
-from bayesfred.model.parameters import BACKGROUND_POWERS, BACKGROUND_TERMS
+from bayesfred.model.parameters import BACKGROUND_TERMS
 
 WIDTHS = 4.0  # radius of the pixels that tell of a source, in widths of the PSF
 REACH = 0.75  # pixel, added so that the pixel of the image's middle is always among them

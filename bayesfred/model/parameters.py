@@ -9,6 +9,7 @@ row of `SOURCE_NUISANCES` and a field of the kernels' `Nuisance` tuple.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from math import comb
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -18,7 +19,9 @@ from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.forward import ForwardModel
+from bayesfred.imaging.monomials import term_name
 from bayesfred.io.serialize import serializable
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, MOST_ORDER
 
 FluxMode = Literal["fixed", "scale", "free"]
 LEAST_SHAPE = 1.0  # of a Gamma prior; the integral over fluxes is expanded in its inverse
@@ -41,10 +44,11 @@ class Nuisances:
     psf_sigma : bool
         Whether the PSF's width is unknown: parameter `psf_sigma`, pixel, the `sigma` that a PSF of
         any kind has.
-    background_order : {0, 1, 2}
+    background_order : {0, 1, 2, 3, 4}
         Degree of the background polynomial in u and v, which run from -1 to 1 over the frame:
         parameters `background`, then `background_u`, `background_v`, then `background_u2`,
-        `background_uv`, `background_v2`, counts per pixel.
+        `background_uv`, `background_v2` and so on, counts per pixel. A lens that vignettes the
+        light of the sky needs 4.
     footprint : float or None, pixel
         Only pixels within this distance of a catalogue position enter the likelihood; for frames
         with sources that the catalogue lacks. `follow_images` puts the images in the place of the
@@ -89,9 +93,10 @@ class Nuisances:
         if self.flux not in get_args(FluxMode):
             expected = ", ".join(get_args(FluxMode))
             raise InputError(f"nuisances: flux: got {self.flux!r}, expected one of {expected}")
-        if self.background_order not in (0, 1, 2):
+        if self.background_order not in range(MOST_ORDER + 1):
             raise InputError(
-                f"nuisances: background_order: got {self.background_order!r}, expected 0, 1 or 2"
+                f"nuisances: background_order: got {self.background_order!r}, expected an integer "
+                f"from 0 to {MOST_ORDER}"
             )
         if self.footprint is not None and not (np.isfinite(self.footprint) and self.footprint > 0):
             raise InputError(
@@ -120,7 +125,7 @@ class Nuisances:
     @property
     def background_names(self) -> tuple[str, ...]:
         """The coefficients of the background polynomial."""
-        return BACKGROUND_TERMS[: (1, 3, 6)[self.background_order]]
+        return BACKGROUND_TERMS[: comb(self.background_order + 2, 2)]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,14 +199,9 @@ SOURCE_NUISANCES = (
     ),
 )  # fmt: skip
 SCALES = ("position_scatter", "model_error")  # they leave the expected counts as they are
-BACKGROUND_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of u and v, in slot order
 BACKGROUND_TERMS = (
     "background",
-    "background_u",
-    "background_v",
-    "background_u2",
-    "background_uv",
-    "background_v2",
+    *(term_name("background", (0, 0, m, n)) for m, n in BACKGROUND_POWERS[1:]),
 )
 
 

@@ -12,9 +12,9 @@ from bayesfred.imaging.detector import Detector
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import SEGMENT, stride
 from bayesfred.io.memory import require_room
-from bayesfred.model.kernels.contexts import LIMIT, MASKED, Frame
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, LIMIT, MASKED, Frame
 from bayesfred.model.noise import Noise, model_error_terms
-from bayesfred.model.parameters import BACKGROUND_POWERS, Nuisances
+from bayesfred.model.parameters import Nuisances
 
 OVERLAP = 12.0  # PSF widths beyond which sources have nothing to do with one another
 BYTES_A_PAIR = 200.0  # that overlaps, in the search for the maximum

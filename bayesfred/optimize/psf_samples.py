@@ -9,8 +9,9 @@ from scipy.optimize import brentq
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.distortion import PolynomialDistortion
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS
 from bayesfred.model.kernels.psf_samples import SourceSamples, find_samples
-from bayesfred.model.parameters import BACKGROUND_POWERS, displacing
+from bayesfred.model.parameters import displacing
 from bayesfred.model.posterior import Posterior
 
 OUTLYING = 6.0  # standard deviations beyond which a pixel counts less

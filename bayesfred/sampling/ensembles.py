@@ -31,7 +31,7 @@ from bayesfred.sampling.moves import LaplaceMove
 
 DE_SHARE = 0.05  # of the steps after the first look move by differential evolution
 # Share of accepted moves below which proposals are adapted. Early it costs few draws, but they have
-# to be enough for a covariance.
+# to be enough for a covariance: of many parameters that is at a later look.
 POOR, POOR_EARLY, EARLY, DRAWS_A_PARAMETER = 0.3, 0.5, 32, 25
 LOOKS = (8, 16, 32, 64, 128, 256)  # steps after which this is checked, over the latter half of them
 DE_SHARE_ADAPTED = 0.2  # ... where proposals had to be adapted
@@ -213,7 +213,8 @@ def _poor(chain: Floats, look: int) -> bool:
     """Whether too few moves are accepted before a look."""
     ensembles, _, walkers, d = chain.shape
     draws = ensembles * walkers * (look - look // 2)
-    early = look <= EARLY and draws >= DRAWS_A_PARAMETER * d
+    enough = DRAWS_A_PARAMETER * d
+    early = draws >= enough and (look <= EARLY or draws // 2 < enough)  # or the first of enough
     return _accepted(chain, look) < (POOR_EARLY if early else POOR)
 
 

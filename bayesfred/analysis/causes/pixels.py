@@ -12,6 +12,7 @@ from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.common import common_pattern
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, MOST_ORDER
 from bayesfred.model.noise import PoissonNoise
 
 FEWEST_FULL = 3  # equal pixels at the top that are a pile
@@ -25,7 +26,7 @@ AROUND = 9  # lines, among which one is compared
 FEW_LINES = 0.05  # of the lines: more than these are all
 NAMED = 5  # lines listed
 LINES = "rows or columns"
-MENDED = 0.8  # of what is wrong with a background, or a polynomial is no remedy
+TILES_A_TERM = 2  # at least, for a polynomial to be tried
 STEEPEST = (
     30.0  # times the background's, to which noise in proportion to the counts is extrapolated
 )
@@ -238,26 +239,42 @@ def _background(
     context: Context, tiles: tuple[Floats, Floats, Floats], ratio: float, everywhere: float
 ) -> Iterator[Finding]:
     """A background that is not the polynomial that was fitted."""
-    mean, size, (u, v) = tiles
+    mean, size, _ = tiles
     held = float(np.sum(size * mean**2) - ratio * mean.size)
-    if held < NOTICEABLE * ratio * (2.0 * mean.size) ** 0.5:
+    if not _noticed(held + ratio * mean.size, ratio, mean.size):
         return
-    order = context.posterior.nuisances.background_order
-    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-    root = np.sqrt(size)
-    found, *_ = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)
-    smooth = float(np.sum((root * (design @ found)) ** 2))
+    mending = _mending_order(context.posterior.nuisances.background_order, tiles, ratio)
     excess = held / float(np.sum(size))  # of what the noise of so few pixels makes of the means
     by = float((excess * np.median(context.variance[context.used])) ** 0.5)
-    mends = order < 2 and smooth > MENDED * held
     cause = Cause(
         "background", 0.0,
         f"the background between the sources differs from the model's by {by:.2g} counts a pixel "
         "(root mean square), from one part of the frame to another",
-        f"set nuisances.background_order = {2 if order or len(mean) > 20 else 1}" if mends else
+        f"set nuisances.background_order = {mending}" if mending else
         "subtract a background first, or mask what is not background",
     )  # fmt: skip
     yield Finding(cause, held * everywhere, "background")
+
+
+def _mending_order(order: int, tiles: tuple[Floats, Floats, Floats], ratio: float) -> int | None:
+    """The least order, above the one that was fitted, that leaves nothing to notice."""
+    mean, size, (u, v) = tiles
+    root = np.sqrt(size)
+    for more in range(order + 1, MOST_ORDER + 1):
+        powers = BACKGROUND_POWERS[: math.comb(more + 2, 2)]
+        if mean.size < TILES_A_TERM * len(powers):
+            break
+        design = np.stack([u**m * v**n for m, n in powers], axis=1) * root[:, None]
+        found, *_ = np.linalg.lstsq(design, mean * root, rcond=None)
+        left = float(np.sum((mean * root - design @ found) ** 2))
+        if not _noticed(left, ratio, mean.size - len(powers)):
+            return more
+    return None
+
+
+def _noticed(squares: float, ratio: float, number: int) -> bool:
+    """Whether squares of that sum are more than chance, given their mean by chance."""
+    return squares > ratio * (number + NOTICEABLE * math.sqrt(2.0 * number))
 
 
 def _noise(context: Context, ratio: float) -> Finding:

@@ -14,6 +14,11 @@ Bytes = npt.NDArray[np.uint8]
 MASKED = -1e300  # stands for the counts of a pixel outside the likelihood
 LIMIT = -1e299
 STRETCH = 512  # pixels that are summed at a time where it takes several passes
+MOST_ORDER = 4  # of the background polynomial
+# Of u and v, the terms of the background one after another.
+BACKGROUND_POWERS = tuple(
+    (order - n, n) for order in range(MOST_ORDER + 1) for n in range(order + 1)
+)
 
 
 class Frame(NamedTuple):
@@ -83,7 +88,7 @@ class Vectors(NamedTuple):
 
     theta: Floats  # (n, k)
     nuisances: Floats  # (n, 6) in the order of SourceNuisances
-    background: Floats  # (n, 6) coefficients of 1, u, v, u^2, uv, v^2; u, v from -1 to 1
+    background: Floats  # (n, 15) coefficients in the order of `BACKGROUND_POWERS`
 
 
 class Parameters(NamedTuple):

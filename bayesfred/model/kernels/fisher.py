@@ -19,13 +19,14 @@ from bayesfred.model.kernels.clusters import (
     one_cluster,
     shift_prior,
 )
-from bayesfred.model.kernels.contexts import LIMIT
+from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, LIMIT
 from bayesfred.model.kernels.factors import cholesky, invert, solve
 from bayesfred.model.kernels.likelihood import (
     U,
     background_row,
     log_likelihood,
     next_run,
+    rise,
     unreached_pixels,
 )
 from bayesfred.model.kernels.noise_dispatch import (
@@ -59,12 +60,12 @@ def _fill_weight(frame, noise, w, background):
     known = 0.0
     pitch = frame.values.size // frame.ny
     for j in range(frame.ny):
-        c0, c1, c2 = background_row(background, j, frame.ny)
+        row = background_row(background, j, frame.ny)
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
                 u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                mu = w.image[p] + c0 + u * (c1 + u * c2)
+                mu = w.image[p] + row[0] + rise(row, u)
                 counted = frame.values[p] > LIMIT
                 w.weight[p] = information(noise, mu, w.image[p], U(p)) if counted else 0.0
                 known += error_information(noise, mu, w.image[p], U(p)) if counted else 0.0
@@ -75,17 +76,18 @@ def _fill_weight(frame, noise, w, background):
 @leaf()
 def _fill_background(frame, band, sources):
     """Derivatives with respect to the background's coefficients."""
-    out, terms = band.jacobian, band.jacobian.shape[0] - sources
+    left, step = 1.0 / frame.nx - 1.0, 2.0 / frame.nx
     for j in range(band.top, band.last):
         v, i = (2 * j - frame.ny + 1) / frame.ny, j - band.top
-        for k in range(out.shape[2]):
-            u = (2 * k - frame.nx + 1) / frame.nx
-            out[sources, i, k] = 1.0
-            if terms > 1:
-                out[sources + 1, i, k], out[sources + 2, i, k] = u, v
-            if terms > 3:
-                out[sources + 3, i, k], out[sources + 4, i, k] = u * u, u * v
-                out[sources + 5, i, k] = v * v
+        rows = band.jacobian[sources:, i]
+        for t in range(rows.shape[0]):
+            m, n = BACKGROUND_POWERS[t]
+            if m == 0:
+                rows[t] = v**n
+            else:
+                lower = rows[t - m - n]  # of the term with a power less of u
+                for k in range(rows.shape[1]):
+                    rows[t, k] = (left + step * k) * lower[k]
 
 
 @leaf()
@@ -174,12 +176,12 @@ def _weigh_by_error(frame, noise, w, background):
     """W c into w.score and W c^2 into w.ratio, where c = d ln variance / d eps."""
     pitch = frame.values.size // frame.ny
     for j in range(frame.ny):
-        c0, c1, c2 = background_row(background, j, frame.ny)
+        row = background_row(background, j, frame.ny)
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
                 u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                mu = w.image[p] + c0 + u * (c1 + u * c2)
+                mu = w.image[p] + row[0] + rise(row, u)
                 c = math.sqrt(2.0 * error_information(noise, mu, w.image[p], U(p)))
                 w.score[p] = w.weight[p] * c
                 w.ratio[p] = w.score[p] * c

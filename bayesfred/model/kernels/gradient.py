@@ -54,6 +54,7 @@ from bayesfred.model.kernels.likelihood import (
     blank,
     log_likelihood,
     next_run,
+    rise,
     unreached_pixels,
     weigh_rows,
 )
@@ -100,13 +101,13 @@ _responses = by_exactness(_no_responses, _light_responses)
 def _fill_responses(noise, frame, w, background):
     out, pitch = blank(w, w.images[2]), w.image.size // frame.ny
     for j in range(frame.ny):
-        c0, c1, c2 = background_row(background, j, frame.ny)
+        row = background_row(background, j, frame.ny)
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
                 if frame.values[p] > LIMIT:
                     u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                    mu = w.image[p] + c0 + u * (c1 + u * c2)
+                    mu = w.image[p] + row[0] + rise(row, u)
                     out[p] = -error_slopes(noise, frame.values[p], mu, w.image[p], U(p))[0]
             start, stop = next_run(w, j, stop)
     return out
@@ -136,14 +137,14 @@ def _fill_images(noise, frame, w, background, h, y):
     light, level, slope = w.images[0], blank(w, w.images[3]), 0.0  # where h is, too
     pitch = w.image.size // frame.ny
     for j in range(frame.ny):
-        c0, c1, c2 = background_row(background, j, frame.ny)
+        row = background_row(background, j, frame.ny)
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
                 more = 0.0
                 if frame.values[p] > LIMIT:
                     u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                    mu = w.image[p] + c0 + u * (c1 + u * c2)
+                    mu = w.image[p] + row[0] + rise(row, u)
                     by = error_slopes(noise, frame.values[p], mu, w.image[p], U(p))
                     a, b = (h[p], y[p]) if profiled else (0.0, 0.0)
                     curve = w.weight[p] * w.ratio[p] * a if profiled else 0.0

@@ -6,7 +6,7 @@ zero between calls; the reader clears it.
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,11 +15,21 @@ from bayesfred.imaging.kernels.compilation import entry, inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import LANES, SEGMENT, Optics, SourceNuisances
 from bayesfred.imaging.kernels.fastmath import FAST, wide_vectors
 from bayesfred.imaging.kernels.geometry import find_footprints, locate, new_geometry
-from bayesfred.model.kernels.contexts import LIMIT, STRETCH, Unreached, Workspace
+from bayesfred.model.kernels.contexts import (
+    BACKGROUND_POWERS,
+    LIMIT,
+    STRETCH,
+    Unreached,
+    Workspace,
+)
 from bayesfred.model.kernels.noise_dispatch import derivatives, given, summed, unreached
 
 LEAST = 1e-200  # weight of a pixel that tells anything
 U = np.uint64  # an index that has no sign need not be compared with zero
+
+
+# Coefficients of the background on a row of pixels, in powers of u, which runs from -1 to 1.
+BackgroundRow: TypeAlias = tuple[float, float, float, float, float]
 
 
 class Stretch(NamedTuple):
@@ -28,10 +38,7 @@ class Stretch(NamedTuple):
     values: Floats
     image: Floats
     first: int
-    # the background c0 + x (c1 + x c2) at x = u + step i
-    c0: float
-    c1: float
-    c2: float
+    row: BackgroundRow  # at x = u + step i
     u: float
     step: float
 
@@ -199,19 +206,26 @@ def blank(w, image):
 
 @leaf()
 def background_row(background, j, ny):
-    """Coefficients of the background on row j in powers of u, which runs from -1 to 1."""
-    v = (2 * j - ny + 1) / ny
-    c0 = background[0] + v * (background[2] + v * background[5])
-    return c0, background[1] + v * background[4], background[3]
+    """The background on row j; its coefficients are in the order of `BACKGROUND_POWERS`."""
+    v, k = (2 * j - ny + 1) / ny, background
+    constant = k[0] + v * (k[2] + v * (k[5] + v * (k[9] + v * k[14])))
+    linear = k[1] + v * (k[4] + v * (k[8] + v * k[13]))
+    return constant, linear, k[3] + v * (k[7] + v * k[12]), k[6] + v * k[11], k[10]
+
+
+@inner(inline="always")
+def rise(row, x):
+    """By how much the background of a row is higher at x than in its middle."""
+    return x * (row[1] + x * (row[2] + x * (row[3] + x * row[4])))
 
 
 @inner(inline="always")
 def stretch(frame, background, j, first, image):
     """The pixels of row j from pixel `first` of the padded frame on, as many as in `image`."""
     low = first - j * (frame.values.size // frame.ny)
-    c0, c1, c2 = background_row(background, j, frame.ny)
+    row = background_row(background, j, frame.ny)
     u, step = (2 * low - frame.nx + 1) / frame.nx, 2.0 / frame.nx
-    return Stretch(frame.values[first : first + image.size], image, first, c0, c1, c2, u, step)
+    return Stretch(frame.values[first : first + image.size], image, first, row, u, step)
 
 
 @leaf(fastmath=FAST)
@@ -222,10 +236,9 @@ def weigh_run(noise, part, score, weight, ratio):
     weight, which may be None, the score alone.
     """
     values, image, first = part.values, part.image, part.first
-    c0, c1, c2, u, step = part.c0, part.c1, part.c2, part.u, part.step
+    row, u, step = part.row, part.u, part.step
     for i in range(values.size):
-        x = u + step * i
-        mu = image[i] + (c0 + x * (c1 + x * c2))
+        mu = image[i] + (row[0] + rise(row, u + step * i))
         counted = values[i] > LIMIT
         s, w, c = derivatives(noise, values[i] if counted else mu, mu, image[i], U(first + i))
         score[i] = s if counted else 0.0
@@ -258,28 +271,31 @@ def weigh_rows(frame, noise, w, place, weights, ratios):
 def slope_run(part, out):
     """The image of a stretch plus the part of the background that varies along it."""
     for i in range(out.size):
-        x = part.u + part.step * i
-        out[i] = part.image[i] + x * (part.c1 + x * part.c2)
+        out[i] = part.image[i] + rise(part.row, part.u + part.step * i)
 
 
 @leaf()
 def add_background_sums(frame, w, image, out):
-    """Add the sum of the image times 1, u, v, u^2, uv, v^2 over the marked pixels."""
+    """Add the sums of the image times the background's terms over the marked pixels."""
     pitch = frame.values.size // frame.ny
     for j in range(frame.ny):
-        v = (2 * j - frame.ny + 1) / frame.ny
+        zero, one, two, three, four = 0.0, 0.0, 0.0, 0.0, 0.0  # times powers of u
         start, stop = next_run(w, j, w.span[j, 0])
         while start >= 0:
             for p in range(j * pitch + start * SEGMENT, j * pitch + stop * SEGMENT):
                 if frame.values[p] > LIMIT:
                     u = (2 * (p - j * pitch) - frame.nx + 1) / frame.nx
-                    out[0] += image[p]
-                    out[1] += image[p] * u
-                    out[2] += image[p] * v
-                    out[3] += image[p] * u * u
-                    out[4] += image[p] * u * v
-                    out[5] += image[p] * v * v
+                    square = u * u
+                    zero += image[p]
+                    one += image[p] * u
+                    two += image[p] * square
+                    three += image[p] * (square * u)
+                    four += image[p] * (square * square)
             start, stop = next_run(w, j, stop)
+        v, sums = (2 * j - frame.ny + 1) / frame.ny, (zero, one, two, three, four)
+        for k in range(out.size):
+            m, n = BACKGROUND_POWERS[k]
+            out[k] += sums[m] * v**n
 
 
 @leaf()
@@ -327,7 +343,7 @@ def _sum_marked(frame, noise, w, background):
             level, image = background[0], light
             if frame.varies:
                 part = stretch(frame, background, j, a, light)
-                level, image = part.c0, w.score[a:b]
+                level, image = part.row[0], w.score[a:b]
                 slope_run(part, image)
             mean = (image, level, None)
             total += summed(noise, frame.values[a:b], light, mean, (a, w.scratch))

@@ -8,7 +8,7 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import leaf, shared
 from bayesfred.imaging.kernels.fastmath import FAST
 from bayesfred.model.kernels.contexts import LIMIT
-from bayesfred.model.kernels.likelihood import room, stretch, weigh_run
+from bayesfred.model.kernels.likelihood import rise, room, stretch, weigh_run
 
 
 class Patch(NamedTuple):
@@ -66,9 +66,8 @@ def weigh_patch(frame, noise, background, patch, rows, ratios):
 @leaf(fastmath=FAST)
 def _excess_run(part, score, weight):
     for i in range(score.size):
-        x = part.u + part.step * i
         counted = part.values[i] > LIMIT
-        above = part.values[i] - (part.c0 + x * (part.c1 + x * part.c2))
+        above = part.values[i] - (part.row[0] + rise(part.row, part.u + part.step * i))
         score[i], weight[i] = above if counted else 0.0, 1.0 if counted else 0.0
 
 

@@ -220,7 +220,7 @@ def log_density(frame, parameters, cluster):
         image = patch.image[a:b]
         part = stretch(frame, parameters.background, patch.top + j, first, image)
         slope_run(part, patch.score[a:b])
-        mean = (patch.score[a:b], part.c0, None)
+        mean = (patch.score[a:b], part.row[0], None)
         value += sum_pixels(noise, part.values, image, mean, first)
     return value + log_prior(cluster)
 
