@@ -326,6 +326,15 @@ def test_images_are_found_where_positions_are_off_by_more_than_the_psf_is_wide(
     assert value == pytest.approx(expected, abs=0.01)
 
 
+def test_an_enormous_scatter_takes_no_longer_than_the_frame_is_wide() -> None:
+    posterior, named = scattered(three(4e3), 0.1, np.random.default_rng(55), 3.0)
+    params = np.array([named[name] for name in posterior.parameter_names])
+    there = posterior.log_prob(params)
+    for enormous in (1e3, 1e12, 1e300):
+        params[posterior.parameter_names.index("position_scatter")] = enormous
+        assert not posterior.log_prob(params) > there
+
+
 def test_scatter_is_outside_the_support_below_zero_and_needs_free_fluxes() -> None:
     model = three(4e3)
     rng = np.random.default_rng(52)

@@ -100,10 +100,8 @@ def _height(cluster, s, told, shift):
     prior, (above, below) = cluster.prior, told
     if not below > 0.0:
         return -math.inf
-    flux, (ratio, _) = (
-        _first_flux(prior, cluster.scale[s], above, below),
-        shift_prior(shift, prior.scatter),
-    )
+    flux = _first_flux(prior, cluster.scale[s], above, below)
+    ratio, _ = shift_prior(shift, prior.scatter)
     value = flux * (above - 0.5 * flux * below - 1.0 / cluster.scale[s])
     return value + prior.shape * math.log(flux) - (0.5 * DOF + 1.0) * math.log1p(ratio)
 
@@ -127,8 +125,8 @@ def _match(cluster, s, level):
     a_u, a_v, b_u, b_v = pitch * a[1, 0], pitch * a[0, 1], pitch * b[1, 0], pitch * b[0, 1]
     det = a_u * b_v - a_v * b_u
     step = max(int(layout.sigma / math.sqrt(det)), 1)
-    columns = int(reach * math.hypot(a_v, b_v) / det) // step * step
-    rows = int(reach * math.hypot(a_u, b_u) / det) // step * step
+    columns = int(min(reach * math.hypot(a_v, b_v) / det, layout.optics.nx)) // step * step
+    rows = int(min(reach * math.hypot(a_u, b_u) / det, layout.optics.ny)) // step * step
     highest, best = -math.inf, (0, 0)
     for j in range(-rows, rows + 1, step):
         for i in range(-columns, columns + 1, step):
