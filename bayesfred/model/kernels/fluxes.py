@@ -192,7 +192,7 @@ def profile(problem, layout, w, parameters, known, profiled):
             _resume(cluster, known.start)
         else:
             fill_excess(problem.frame, parameters.background, patch)
-            start(cluster, parameters)
+            start(cluster, max(parameters.background[0], 1.0))
         gain = _highest(problem, parameters, cluster, known, h, touching.scatters)
         if math.isnan(gain):
             return math.nan if known.nearby.e.size > 0 else -math.inf

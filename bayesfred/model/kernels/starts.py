@@ -12,8 +12,7 @@ wings begins at the prior's maximum.
 Newton's steps reach an image from about a width of the PSF. Where positions scatter by as much a
 source begins at the shift, in whole pixels, at which the same and the prior of the shift are
 largest, and between the pixels where a parabola through A is largest. What the catalogue has as
-brighter chooses first. Its light is then subtracted, and its variance is added to v, lest a fainter
-neighbour choose the same image or what is left of it.
+brighter chooses first. Its light is then subtracted, lest a fainter neighbour choose it, too.
 """
 
 import math
@@ -21,6 +20,7 @@ import math
 import numpy as np
 
 from bayesfred.imaging.kernels.compilation import inner, leaf
+from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import SCATTER, move
 from bayesfred.model.kernels.clusters import DOF, add_template, shift_prior
@@ -143,18 +143,6 @@ def _match(cluster, s, level):
 
 
 @leaf()
-def _subtract(cluster, s, level, error):
-    """Subtract a source's light, which is right to a fraction, from what others are fitted to."""
-    fp, stamp, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
-    values, weights = cluster.patch.score, cluster.patch.weight
-    for p in range(fp.first[s], fp.first[s + 1]):
-        for k in range(fp.size[p]):
-            light, j = cluster.fluxes[s] * stamp[fp.start[p] + k], at[p] + k
-            values[j] -= light
-            weights[j] /= 1.0 + weights[j] * (light + (error * light) ** 2) / level
-
-
-@leaf()
 def _far(cluster):
     """Whether sources may be farther from where they are predicted than Newton's steps reach."""
     return cluster.prior.scatter > WIDE * cluster.layout.sigma
@@ -183,10 +171,10 @@ def _in_turn(cluster, scatters):
 
 
 @inner()
-def start(cluster, parameters):
+def start(cluster, level):
     """Fill templates, fluxes and shifts, and the image."""
     fp, stamps, fluxes = cluster.layout.footprints, cluster.touching.stamps, cluster.fluxes
-    level, scatters = max(parameters.background[0], 1.0), cluster.touching.scatters
+    scatters, rest = cluster.touching.scatters, Canvas(cluster.patch.score, cluster.canvas.at)
     for s in _in_turn(cluster, scatters):
         _place(cluster, s, level, scatters)
         above, below, every = _least_squares(cluster, s)
@@ -196,6 +184,7 @@ def start(cluster, parameters):
         for m in range(1, stamps.shape[0]):
             for i in range(fp.start[fp.first[s]], fp.start[fp.first[s + 1]]):
                 stamps[m, i] *= fluxes[s]
-        add_template(fp, (fp.first[s], fp.first[s + 1]), stamps[0], fluxes[s], cluster.canvas)
+        rows = fp.first[s], fp.first[s + 1]
+        add_template(fp, rows, stamps[0], fluxes[s], cluster.canvas)
         if scatters is not None and _far(cluster):
-            _subtract(cluster, s, level, parameters.nuisances.model_error)
+            add_template(fp, rows, stamps[0], -fluxes[s], rest)
