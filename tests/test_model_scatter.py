@@ -316,7 +316,7 @@ def test_images_are_found_where_positions_are_off_by_more_than_the_psf_is_wide(
     model = make_model(catalogue, sigma=0.8 * binning, detector=detector)
     rng, tau = np.random.default_rng(54), 2.0 * binning
     named = known({**make_truth(model, rng, 30.0), "position_scatter": tau}, SCATTER)
-    shifts = np.array([[-3.0, 4.0], [-6.5, 3.0], [5.5, -5.5]]) * binning
+    shifts = np.array([[-3.0, 4.33], [-6.5, 3.0], [5.5, -5.5]]) * binning
     images = [f * shifted_image(model, named, s, shifts[s]) for s, f in enumerate(flux)]
     mean = np.sum(images, axis=0) + background_image(detector.shape, named)
     posterior = Posterior(model, rng.poisson(mean), nuisances=SCATTER)
