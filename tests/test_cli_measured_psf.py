@@ -210,7 +210,7 @@ def test_where_no_psf_is_found_other_causes_are_told(
     (frames / "corners.toml").write_text(text, encoding="utf-8")
     output = invoke(frames, "fit", "corners.toml", "--map-only")
     said = "no PSF found in 40 turns. Or it is the background: "
-    assert_refused(output, said, "set nuisances.background_order = 2")
+    assert_refused(output, said, "mask what is not background")
 
 
 def test_dark_marks_are_told_before_the_fit(frames: Path) -> None:

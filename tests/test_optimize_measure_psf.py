@@ -191,7 +191,7 @@ def test_a_psf_is_measured_where_positions_do_not_scatter_at_all(monkeypatch) ->
     monkeypatch.setattr(psf_equations, "LEAST_SCATTER", 0.0)
     try:
         singular = measured(1e-11)
-    except InputError:
+    except (InputError, np.linalg.LinAlgError):
         return
     assert np.abs(singular - known).max() > 1e-3 * known.max()
 
