@@ -240,9 +240,10 @@ def _background(
 ) -> Iterator[Finding]:
     """A background that is not the polynomial that was fitted."""
     mean, size, _ = tiles
-    held = float(np.sum(size * mean**2) - ratio * mean.size)
-    if not _noticed(held + ratio * mean.size, ratio, mean.size):
+    squares = float(np.sum(size * mean**2))
+    if not _noticed(squares, ratio, mean.size):
         return
+    held = squares - ratio * mean.size
     mending = _mending_order(context.posterior.nuisances.background_order, tiles, ratio)
     excess = held / float(np.sum(size))  # of what the noise of so few pixels makes of the means
     by = float((excess * np.median(context.variance[context.used])) ** 0.5)
