@@ -58,7 +58,7 @@ def crowded(rng, n_pixels=40, n_sources=3):
 @pytest.mark.parametrize(("degree", "wings"), [(1, True), (1, False), (0, True), (0, False)])
 def test_information_and_slope_agree_with_a_dense_design_matrix(degree, wings):
     rng = np.random.default_rng(1)
-    grid = PsfGrid(1.3, 0.8, degree, 5.6, 4.0, 16.8 if wings else 0.0)
+    grid = PsfGrid(1.3, 0.8, degree, 5.6, 16.8 if wings else 0.0)
     samples = crowded(rng)
     field = np.column_stack([np.ones(3), rng.normal(size=(3, 2 * degree))])
     levels, n = grid.unknown, len(samples.first) - 1
@@ -130,7 +130,7 @@ def test_samples_are_those_that_loops_over_pixels_find(distortion):
 
 def test_the_grids_together_are_one_fine_grid():
     rng = np.random.default_rng(2)
-    grid = PsfGrid(4.0, 0.7, 2, 4.9, 3.5, 14.7)
+    grid = PsfGrid(4.0, 0.7, 2, 4.9, 14.7)
     c = rng.normal(size=grid.conventions.shape[1])
     psf = grid.combined(c)
     n = psf.shape[-1]
@@ -272,6 +272,25 @@ def test_coma_that_grows_outward_is_recovered_only_by_a_psf_that_varies():
         assert off[0] < 0.03 and off[1] > 2.0 * off[0], off
 
 
+def test_wings_that_vary_over_the_field_are_recovered():
+    """At 6 widths: what varies reaches as far out as what does not."""
+    x, sigma = np.arange(-26, 27) / 4.0, 0.8
+    a, b = x + 0.0 * x[:, None], x[:, None] + 0.0 * x
+    core = np.exp(-0.5 * (a**2 + b**2) / sigma**2)
+    ring = 0.02 * np.exp(-(((np.hypot(a, b) - 4.8) / 0.6) ** 2))
+    turned = ring * np.cos(2.0 * np.arctan2(b, a))
+    true = bf.MeasuredPSF(np.stack([core + 1.2 * ring, turned, 0.0 * ring]), 4.0, 40.0)
+    _, _, posterior = frame_of(true, 2.3548 * sigma, pixel="impulse")
+    measured = bf.fit_psf(posterior, bf.find_map(posterior), degree=1)
+    along, across = np.array([4.8, -4.8, 0.0, 0.0]), np.array([0.0, 0.0, 4.8, -4.8])
+    expected, found = (
+        psf.density(along, across, at=(35.0, 0.0)) - psf.density(along, across, at=(-35.0, 0.0))
+        for psf in (true, measured)
+    )
+    assert np.abs(expected).min() > 0.01 * true.peak
+    np.testing.assert_allclose(found, expected, rtol=0.2)
+
+
 def began(posterior, estimate, degree):
     return starting_state(posterior, estimate, starting_grid(posterior, estimate, 4.0, degree))
 
@@ -319,7 +338,7 @@ def test_conventions_of_volume_and_centroid():
 
 def test_conventions_are_those_of_all_grids_combined():
     """Grids of 1, 2 and 8 fine knots have them, so it does not matter which has what."""
-    grid = PsfGrid(4.0, 1.3, 1, 6.0, 4.0, wings=12.0)
+    grid = PsfGrid(4.0, 1.3, 1, 6.0, wings=12.0)
     c = np.random.default_rng(1).normal(size=grid.conventions.shape[1])
     terms, h = grid.combined(c), 1.0 / grid.oversampling
     x = (np.arange(terms.shape[1]) - 0.5 * (terms.shape[1] - 1)) * h

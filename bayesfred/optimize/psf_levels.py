@@ -83,9 +83,7 @@ class PsfGrid:
     degree : int
         Of the variation over the field.
     fine_radius : float, pixel
-        Of the fine grid.
-    varying_radius : float, pixel
-        Of the grid for the variation over the field.
+        Of the fine grid, and of that for the variation over the field.
     wings : float, pixel
         Radius of the grid for wings; 0 where there is none.
     """
@@ -94,7 +92,6 @@ class PsfGrid:
     sigma: float
     degree: int
     fine_radius: float
-    varying_radius: float
     wings: float = 0.0
 
     @property
@@ -108,7 +105,7 @@ class PsfGrid:
         terms = len(field_powers(self.degree))
         rows = [(1, self.fine_radius, 0, 1), (1, self.fine_radius, 0, 1)]
         if terms > 1:
-            rows.append((2, self.varying_radius, 1, terms))
+            rows.append((2, self.fine_radius, 1, terms))
         if self.wings:
             rows.append((8, self.wings, 0, 1))
         h = np.array([times / self.oversampling for times, *_ in rows])

@@ -45,8 +45,8 @@ SUPPORT = 4  # B-splines that are not zero at a point of an axis
 CHOICES = 10  # of the strength, at the most
 SETTLED = 0.1  # change of its logarithm
 NEAR = 1e-3  # of a solution that others will follow
-PRECISE = 1e-4  # of the last one: the whole is thousands of standard deviations long
-ROUGH = 0.01  # where its product with the slope is wanted, which is off by the square
+PRECISE = 1e-5  # of the last one: the whole is thousands of standard deviations long
+ROUGH = 3e-3  # where its product with the slope is wanted, which is off by the square
 STEPS = 2000  # of conjugate gradients
 TINY = 1e-9  # of its information that is added to what a source says of itself
 

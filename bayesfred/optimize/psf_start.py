@@ -27,7 +27,6 @@ LIT = 0.02  # of the peak that the light of a sharp PSF exceeds
 MARGIN = 2.0  # pixel around that
 DARK = 0.1  # of the pixels are beyond the PSF of every source, where that can be
 RADIUS = 7.0  # of the fine grid, widths of the PSF
-VARYING = 5.0  # of the grid for the variation over the field, the same
 NARROWEST = 4.0  # of the fine grid, of sharp PSFs and where stars leave no pixels between them
 
 
@@ -52,7 +51,7 @@ def starting_grid(
     width = math.hypot(*_widths(posterior, estimate.params))
     knots = max(1.0, min(oversampling, oversampling * FULLY_SAMPLED / (FWHM * width)))
     radius = min(RADIUS * width, max(NARROWEST * width, reach(posterior, estimate.params)))
-    return PsfGrid(knots, width, degree, radius, min(VARYING * width, radius))
+    return PsfGrid(knots, width, degree, radius)
 
 
 def suited_grid(smooth: PsfGrid, constant: PsfState, oversampling: float) -> PsfGrid:
@@ -82,7 +81,6 @@ def suited_grid(smooth: PsfGrid, constant: PsfState, oversampling: float) -> Psf
         smooth,
         oversampling=min(oversampling, FINER * smooth.oversampling),
         fine_radius=radius,
-        varying_radius=min(light, radius),
     )
     fewer = min(1.0, math.sqrt(MOST / grid.unknown.size()))
     return replace(grid, oversampling=max(smooth.oversampling, fewer * grid.oversampling))
