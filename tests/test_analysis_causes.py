@@ -9,7 +9,7 @@ import planted
 import pytest
 from scipy import stats
 
-from bayesfred.analysis.causes import Cause, find_causes, light
+from bayesfred.analysis.causes import Cause, common, find_causes, light
 from bayesfred.analysis.causes.cause import Finding, psf_remedy, scatter_remedy
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.find import ranked
@@ -76,6 +76,30 @@ def test_a_wrong_psf_is_not_called_companions(name: str, record_property: Any) -
     false = sum("companions" in names for names in named)
     record_property("companions named, of 50", false)
     assert false <= 0.04 * FRAMES
+
+
+def test_a_psf_that_varies_as_a_cubic_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a pattern of the second degree is all that is looked for, sources are blamed.
+
+    The widths follow a Legendre polynomial of the third degree, which has no part in lower ones.
+    """
+    s, sigma = SourceCatalog.grid(18, 15.0, 2e5), 1.4
+    model = ForwardModel(Detector((281, 281)), s, GaussianPSF(sigma), planted.LENS)
+    v, u = np.indices(model.detector.shape) - 140.0
+    mean = np.full(u.shape, 20.0)
+    x = s.x / s.x.max()
+    wide = sigma * (1.0 + 0.08 * (2.5 * x**3 - 1.5 * x))
+    for x_s, y_s, w in zip(s.x, s.y, wide, strict=True):
+        r2 = (u - x_s) ** 2 + (v - y_s) ** 2
+        mean += 2e5 * np.exp(-0.5 * r2 / w**2) / (2.0 * np.pi * w**2)
+    counts = np.random.default_rng(1).poisson(mean).astype(float)
+    posterior = Posterior(model, counts, nuisances=Nuisances(flux="free"))
+    params = find_map(posterior).params
+    first = find_causes(posterior, params)[0]
+    assert first.name == "PSF"
+    assert "differently from one part of the frame to another" in first.sentence
+    monkeypatch.setattr(common, "MOST", 2)
+    assert find_causes(posterior, params)[0].name != "PSF"
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The residual that all sources have in common, in units of their flux."""
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -9,8 +10,8 @@ from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.causes.context import BRIGHT, Context
 
 RINGS, REACH = 8, 4.0  # around each image, and their outer radius in PSF widths
-FEW = 12  # sources that do not tell a pattern that is linear over the field
-QUADRATIC = 36  # sources that tell one of the second degree
+EACH = 6  # sources for each term over the field
+MOST = 4  # degree over the field
 FEWEST = 5  # pixels of a ring
 
 
@@ -29,8 +30,11 @@ class CommonPattern(NamedTuple):
         The common residual, in standard deviations.
     explained : float
         Sum of squares, less what noise gives to the numbers fitted.
-    profile : ndarray, shape (RINGS,)
-        The mean residual of each ring over the sources' flux.
+    numbers : int
+        How many numbers were fitted.
+    profile, spread : ndarray, shape (RINGS,)
+        Of each ring, the residual over the sources' flux: its mean, and the root mean square of
+        what is common.
     """
 
     pixels: tuple[Ints, Ints]
@@ -39,7 +43,9 @@ class CommonPattern(NamedTuple):
     v: Floats
     pattern: Floats
     explained: float
+    numbers: int
     profile: Floats
+    spread: Floats
 
 
 def common_pattern(context: Context, orders: Iterable[int]) -> CommonPattern | None:
@@ -49,8 +55,8 @@ def common_pattern(context: Context, orders: Iterable[int]) -> CommonPattern | N
     ----------
     context : Context
     orders : iterable of int
-        Of the harmonics of the angle along a ring, 0 first. Each varies over the field with a
-        degree of 0, 1 or 2, as the number of sources allows.
+        Of the harmonics of the angle along a ring, 0 first. Each varies over the field, with as
+        high a degree as the number of sources allows, at most 4.
 
     Returns
     -------
@@ -75,9 +81,9 @@ def common_pattern(context: Context, orders: Iterable[int]) -> CommonPattern | N
     ring = (radius / (REACH * s) * RINGS).astype(int)
     x, y = (c / (0.5 * shape.max()) for c in light.position[source].T)
     shapes = [f(m * angle) for m in orders for f in ((np.cos, np.sin) if m else (np.cos,))]
-    over = [np.ones(z.size), x, y, x * x, x * y, y * y]
-    over = over[: 1 if good.sum() < FEW else 3 if good.sum() < QUADRATIC else 6]
-    pattern, explained, profile = np.zeros(z.size), 0.0, np.zeros(RINGS)
+    degree = max(n for n in range(MOST + 1) if n == 0 or good.sum() >= EACH * math.comb(n + 2, 2))
+    over = [x**i * y ** (n - i) for n in range(degree + 1) for i in range(n + 1)]
+    pattern, numbers, (profile, spread) = np.zeros(z.size), 0, np.zeros((2, RINGS))
     for k in range(RINGS):
         here = ring == k
         if here.sum() < FEWEST:
@@ -85,6 +91,9 @@ def common_pattern(context: Context, orders: Iterable[int]) -> CommonPattern | N
         columns = np.stack([(a * b * template)[here] for a in shapes for b in over], axis=1)
         found, *_ = np.linalg.lstsq(columns, z[here], rcond=1e-10)
         pattern[here] = columns @ found
-        explained += float(np.sum(pattern[here] ** 2)) - columns.shape[1]
-        profile[k] = float(columns[:, 0] @ z[here] / max(columns[:, 0] @ columns[:, 0], 1e-300))
-    return CommonPattern((row, column), source, u, v, pattern, explained, profile)
+        numbers += columns.shape[1]
+        square = max(float(columns[:, 0] @ columns[:, 0]), 1e-300)
+        profile[k] = float(columns[:, 0] @ z[here]) / square
+        spread[k] = float(pattern[here] @ pattern[here] / square) ** 0.5
+    explained = float(pattern @ pattern) - numbers
+    return CommonPattern((row, column), source, u, v, pattern, explained, numbers, profile, spread)

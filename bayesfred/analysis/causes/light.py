@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage, stats
 
-from bayesfred._typing import Flags, Floats
+from bayesfred._typing import Flags
 from bayesfred.analysis.causes.cause import (
     MISSING,
     RICHER,
@@ -19,7 +19,7 @@ from bayesfred.analysis.causes.cause import (
     Finding,
     psf_remedy,
 )
-from bayesfred.analysis.causes.common import REACH, RINGS, common_pattern
+from bayesfred.analysis.causes.common import REACH, RINGS, CommonPattern, common_pattern
 from bayesfred.analysis.causes.context import BRIGHT, DETECTED, Context
 
 ENOUGH = 0.85  # of what fluxes of their own explain
@@ -30,6 +30,7 @@ NAMED = 5  # sources listed
 RIM = 0.01  # chance that sources lie as far out, where terms are known to be missing
 RICHEST = 0.7  # weight of companions, which near enough are displacements, too, and other PSFs
 REJECT = "set frame.reject_outliers = true"
+VARIES = 0.3  # of the common residual, below which its mean over the sources says little
 ORDERS = range(5)  # of the pattern that is no companion, coma and trefoil included
 
 
@@ -125,39 +126,41 @@ def psf(context: Context) -> Finding | None:
     displacement.
     """
     found = common_pattern(context, (0, 2))
-    return None if found is None else _shape(context, found.explained, found.profile)
-
-
-def _shape(context: Context, explained: float, profile: Floats) -> Finding | None:
-    if explained < NOTICEABLE * (2.0 * 9 * RINGS) ** 0.5:
+    if found is None or found.explained < NOTICEABLE * (2.0 * found.numbers) ** 0.5:
         return None
-    s = context.light.width
-    peak = 1.0 / (2.0 * np.pi * s**2)
-    worst = int(np.argmax(np.abs(profile)))
-    ring = (worst + 0.5) * REACH / RINGS * s
-    side = "more" if profile[worst] > 0.0 else "less"
-    also = _turns(profile)
     mode = context.posterior.nuisances.psf_sigma
     impulse = context.posterior.model.detector.pixel == "impulse"
     box = ', or pixel = "box" if it is narrow' if impulse else ""
     cause = Cause(
         "PSF", 0.0,
-        f"around the sources the counts have {side} light than the PSF, by "
-        f"{abs(profile[worst]) / peak:.2%} of its peak at {ring:.1f} pixels{also}",
+        _difference(found, context.light.width),
         psf_remedy(
             context.posterior,
             f'fit another PSF: kind = "moffat" or "sampled"{box}' if mode
             else "set nuisances.psf_sigma = true, or fit another PSF",
         ),
     )  # fmt: skip
-    return Finding(cause, explained, "light", RICHER)
+    return Finding(cause, found.explained, "light", RICHER)
 
 
-def _turns(profile: Floats) -> str:
-    """In words, whether the residual changes its sign outward."""
+def _difference(found: CommonPattern, width: float) -> str:
+    """In words, how the light around the sources differs from the PSF."""
+    profile = found.profile
+    varies = np.abs(profile).max() < VARIES * found.spread.max()
+    size = found.spread if varies else np.abs(profile)
+    worst = int(np.argmax(size))
+    share = size[worst] * 2.0 * np.pi * width**2
+    at = f"{share:.2%} of its peak at {(worst + 0.5) * REACH / RINGS * width:.1f} pixels"
+    if varies:
+        return (
+            f"around the sources the light differs from the PSF by {at} (root mean square), "
+            "and differently from one part of the frame to another"
+        )
+    side = "more" if profile[worst] > 0.0 else "less"
     large: Flags = np.abs(profile) > 0.1 * np.abs(profile).max()
-    signs = np.sign(profile[large])
-    return ", and the opposite farther out or in" if np.any(signs != signs[0]) else ""
+    turns = np.unique(np.sign(profile[large])).size > 1
+    also = ", and the opposite farther out or in" if turns else ""
+    return f"around the sources the counts have {side} light than the PSF, by {at}{also}"
 
 
 def companions(context: Context) -> Finding | None:
