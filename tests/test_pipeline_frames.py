@@ -130,3 +130,19 @@ def test_free_fluxes_need_no_column(tmp_path: Path) -> None:
 def fitted(run: Path) -> tuple[bf.Posterior, bf.MapEstimate]:
     posterior, _, _ = pipeline.read_frame(read_settings(run), run, None)
     return posterior, bf.find_map(posterior)
+
+
+def test_a_source_that_does_not_fit_is_left_out(tmp_path: Path) -> None:
+    """One whose catalogue entry is 0.2 pixels off, which no peak of the residuals shows."""
+    run = write(tmp_path, '[nuisances]\nflux = "free"')
+    stars = tmp_path / "stars.csv"
+    stars.write_text(stars.read_text().replace("\n0.0,0.0,", "\n0.2,0.0,"))
+    for rejecting, masked in ("", 0), ("reject_outliers = true\n", 1):
+        run.write_text(run.read_text().replace("[frame]\n", "[frame]\n" + rejecting))
+        kept, estimate, notes = pipeline.read_frame(read_settings(run), run, None)
+        line = "1 of 25 sources do not fit and are left out: rows of the catalogue, from 0: 12"
+        assert sum(note.startswith(line) for note in notes) == masked
+        assert kept.mask[60, 60] == (not masked)
+        assert kept.mask[60, 80]
+    assert estimate is not None
+    assert estimate.fits_data

@@ -48,7 +48,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse, special
+from scipy import sparse, special, stats
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.analysis.absorbed import Absorbed
@@ -56,7 +56,7 @@ from bayesfred.analysis.checks import Check, deviate, largest_deviate, not_teste
 from bayesfred.analysis.sources import SourceFits
 from bayesfred.model.posterior import Posterior
 
-__all__ = ["SourceTests", "source_tests"]
+__all__ = ["SourceTests", "are_bright", "source_tests"]
 
 # The columns of `SourceTests.z`.
 KINDS = {"chi-square": [0], "light": [1], "position": [2, 3], "size and shape": [4, 5, 6]}
@@ -70,6 +70,7 @@ STEP = 1e-3  # share of the variance by which the mean is changed to find the va
 DETERMINED = 1e-4  # share of a template that earlier ones leave, or it is not told from them
 FALSE_ALARM = 0.003  # chance that any source fails if the model is true
 FALSE_ALARM_OF_SPREADS = 0.001
+BY_CHANCE = 1e-4  # that so many of the brightest are among few sources
 
 
 class Spread(NamedTuple):
@@ -181,6 +182,22 @@ def source_tests(
         z[:, k] = _deviates(z[:, k], (weights, variance, slope), fits.owner)
     z = np.column_stack([_chi_square(fits, taken, free), z])
     return SourceTests(z, _discoveries(z), _spreads(covariance, fits, taken, slope, free))
+
+
+def are_bright(fluxes: Floats, failed: Flags) -> bool:
+    """Whether sources that do not fit are brighter than the others.
+
+    Parameters
+    ----------
+    fluxes : ndarray, shape (s,), counts
+    failed : ndarray of bool, shape (s,)
+
+    Returns
+    -------
+    bool
+    """
+    test = stats.mannwhitneyu(fluxes[failed], fluxes[~failed], alternative="greater")
+    return bool(test.pvalue < BY_CHANCE)
 
 
 def _templates(own: Floats) -> Floats:

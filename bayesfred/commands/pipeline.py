@@ -13,6 +13,7 @@ import numpy as np
 from bayesfred import build, settings
 from bayesfred.analysis.causes import find_causes
 from bayesfred.analysis.choose_terms import choose_terms
+from bayesfred.analysis.failed_sources import leave_out_failed
 from bayesfred.build import naming
 from bayesfred.commands.records import Result
 from bayesfred.commands.results import How, Job, Say, make_chain, write_results
@@ -170,12 +171,12 @@ def read_doubted(
             note(*choice.lines())
         if has_pixel(posterior.model.psf) or rough:
             with working("measuring the PSF", show=say is not None):
-                measured, estimate = _with_measured_psf(posterior, estimate, psf, run)
-            lost = posterior.mask & ~measured.mask
-            line = f"not explained by the PSF: {pixels_named(lost)}, masked"
-            note(line if lost.any() else "")
-            posterior = measured
-            note(psf_message(posterior, estimate))
+                posterior, estimate, lines = _with_measured_psf(posterior, estimate, psf, run)
+            note(*lines)
+        if f.reject_outliers and estimate is not None:
+            with working("testing the sources", show=say is not None):
+                posterior, estimate, line = leave_out_failed(posterior, estimate)
+            note(line)
     doubts = [_rejected(given, posterior, estimate), ambiguous]
     return posterior, estimate, notes, list(filter(None, doubts))
 
@@ -234,12 +235,12 @@ def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimat
 
 def _with_measured_psf(
     posterior: Posterior, estimate: MapEstimate | None, psf: PSF, run: settings.RunSettings
-) -> tuple[Posterior, MapEstimate]:
+) -> tuple[Posterior, MapEstimate, list[str]]:
     """The posterior with the errors of its PSF, which is measured first if that is asked for."""
     estimate = estimate or find_map(posterior)
     if isinstance(psf, PSFToMeasure):
         try:
-            return measure_psf(
+            measured, estimate = measure_psf(
                 posterior, estimate, oversampling=psf.oversampling, degree=psf.degree,
                 nodes=psf.nodes, model_error=run.nuisances.model_error,
                 prior=build.priors_given(run), reject_outliers=run.frame.reject_outliers,
@@ -247,8 +248,12 @@ def _with_measured_psf(
         except InputError as error:
             others = _other_causes(posterior, estimate, run.frame.reject_outliers)
             raise InputError(f"{error}{others}") from None
-    posterior = marginalize_psf(posterior, estimate)
-    return posterior, find_map(posterior, estimate.params)
+    else:
+        measured = marginalize_psf(posterior, estimate)
+        estimate = find_map(measured, estimate.params)
+    lost = posterior.mask & ~measured.mask
+    line = f"not explained by the PSF: {pixels_named(lost)}, masked" if lost.any() else ""
+    return measured, estimate, [line, psf_message(measured, estimate)]
 
 
 def _other_causes(posterior: Posterior, estimate: MapEstimate, rejected: bool) -> str:

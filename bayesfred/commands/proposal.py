@@ -30,7 +30,7 @@ TEXT = """\
 
 [frame]
 path = {path}
-{frame}reject_outliers = true  # hot spots, and sources that have no image
+{frame}reject_outliers = true  # hot spots, and sources that have no image or do not fit
 
 [catalogue]
 path = {catalogue}  # columns x, y: pixels from the frame's middle; fluxes are free

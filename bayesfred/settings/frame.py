@@ -42,7 +42,9 @@ class FrameSettings(Section):
         The file of a map of the read-out's variance, whose root is the read noise.
     reject_outliers : bool
         Whether unmatched sources and spurious detections are left out, see
-        `bayesfred.reject_outliers`, and hot pixels before anything is searched for.
+        `bayesfred.reject_outliers`, and hot pixels before anything is searched for. At the maximum
+        single sources that do not fit are left out, unless they are more than a tenth of all or
+        the brightest.
     """
 
     path: Name

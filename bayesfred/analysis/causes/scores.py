@@ -11,9 +11,8 @@ so many numbers if they scattered by what the terms leave. Scatter explains the 
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
-from bayesfred._typing import Flags, Floats, Ints
+from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.causes.cause import (
     MISSING,
     RICHER,
@@ -26,12 +25,11 @@ from bayesfred.analysis.causes.cause import (
 from bayesfred.analysis.causes.find import ranked
 from bayesfred.analysis.causes.light import FEW, NAMED
 from bayesfred.analysis.score_tests import Lead, ScoreTests
-from bayesfred.analysis.source_tests import KINDS, SourceTests
+from bayesfred.analysis.source_tests import KINDS, SourceTests, are_bright
 from bayesfred.imaging.monomials import degree_of
 from bayesfred.model.posterior import Posterior
 
 NOISE = 2.0  # standard deviations by which a spread has to explain more than chance
-BY_CHANCE = 1e-4  # that so many of the brightest are among few sources
 MORE_TERMS = (MISSING, "")
 # The cause, and what frees a number that a score test finds wrong, by the beginning of its name.
 REMEDIES = {
@@ -85,7 +83,7 @@ def hidden_causes(
     if failed.size and few:
         # what no score describes shows in the chi-square
         held = np.maximum(own, squares[:, 0])[failed]
-        bright = _are_bright(posterior.fluxes(params), tests.failed)
+        bright = are_bright(posterior.fluxes(params), tests.failed)
         order = failed[np.argsort(-held)]
         findings.append(_few_sources(posterior, order, float(held.sum()), bright))
     elif failed.size:
@@ -141,12 +139,6 @@ def _terms(finding: Finding, leads: list[Lead], scores: ScoreTests, tests: Sourc
     explained = max(leads[0].z ** 2 - each, joint - number * each)
     remedy = terms_remedy(max(degree_of(lead.name) for lead in leads))
     return replace(finding, cause=replace(finding.cause, remedy=remedy), explained=explained)
-
-
-def _are_bright(fluxes: Floats, failed: Flags) -> bool:
-    """Whether sources that do not fit are brighter than the others."""
-    test = stats.mannwhitneyu(fluxes[failed], fluxes[~failed], alternative="greater")
-    return bool(test.pvalue < BY_CHANCE)
 
 
 def _few_sources(posterior: Posterior, failed: Ints, explained: float, are_bright: bool) -> Finding:
