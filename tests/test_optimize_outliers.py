@@ -322,6 +322,19 @@ def test_crowded_fields_are_right_or_said_not_to_fit(monkeypatch: pytest.MonkeyP
     assert silent >= 1
 
 
+def test_more_is_tolerated_where_more_than_some_would_be_lost() -> None:
+    """Of 81 stars 8 are lost with either limit, 24 with the higher one alone."""
+    for n, tolerated in (8, False), (24, True):
+        posterior, truth, *_ = frame(2, n=n)
+        share, fewer = (
+            reject_once(posterior, truth, outliers.COARSE, most).share
+            for most in (outliers.MOST, outliers.SOME)
+        )
+        assert share >= n / 81
+        assert (fewer == share) != tolerated
+        assert fewer <= outliers.SOME
+
+
 def test_the_share_of_lost_sources_counts_removed_and_masked_ones() -> None:
     posterior, truth, *_ = frame(3, n=0)
     s = posterior.model.sources

@@ -22,7 +22,7 @@ from bayesfred.optimize.joint_map import maximize_frames
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.optimize.modes import ModeSearch, find_modes
 from bayesfred.optimize.newton import NEAR, NO_DENSITY, NewtonResult, maximize
-from bayesfred.optimize.outliers import BREAKDOWN, COARSE, Kept, keep_all, reject
+from bayesfred.optimize.outliers import BREAKDOWN, COARSE, SOME, Kept, keep_all, reject
 from bayesfred.optimize.starts import Start, find_start, other_starts
 
 # The maximum is found where a Newton step from it would move no parameter by more than this share
@@ -187,7 +187,7 @@ def approach(
         _require_determined(posterior, begun, posterior.fisher(params))
         kept = keep_all(posterior, params)[0]
         if rejecting:  # a PSF that is not the frame's leaves a share of all light
-            kept, params, _ = reject(posterior, params, COARSE)
+            kept, params, _ = reject(posterior, params, COARSE, SOME)
         top = maximize(kept.posterior, params, steps=STEPS)
         return kept.posterior, _estimate(kept.posterior, top, top.evaluations, "")
 

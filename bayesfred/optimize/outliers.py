@@ -45,6 +45,7 @@ FAINT = 0.3
 
 # Of the stars at most this share is rejected: else the parameters are wrong, not the catalogue.
 MOST = 0.7
+SOME = 0.2  # with a PSF that is not the frame's, while what it may leave can be tolerated
 # Parameters that reject more than this share of the sources fit what they were fitted to. In
 # crowded fields with a tenth missing and a tenth foreign, wrong ones lose 0.44 to 0.7 of them,
 # right ones 0.27 to 0.48.
@@ -86,11 +87,14 @@ def keep_all(posterior: Posterior, params: Floats) -> tuple[Kept, Floats, int]:
 
 
 def reject(
-    posterior: Posterior, params: Floats, tolerances: Sequence[float] = TOLERANCES
+    posterior: Posterior,
+    params: Floats,
+    tolerances: Sequence[float] = TOLERANCES,
+    most: float = MOST,
 ) -> tuple[Kept, Floats, int]:
     """Reject and maximise in turns until the same is rejected again.
 
-    With `tolerances` as of `reject_once`.
+    With `tolerances` and `most` as of `reject_once`.
 
     Returns
     -------
@@ -105,7 +109,7 @@ def reject(
     for _ in range(ROUNDS):
         if not np.isfinite(posterior.log_prob(params)):  # folded where a source is missing
             break
-        found = reject_once(posterior, params, tolerances)
+        found = reject_once(posterior, params, tolerances, most)
         key = found.missing.tobytes() + found.lost.tobytes()
         if key in seen:
             break
@@ -142,11 +146,15 @@ def share_lost(given: Posterior, kept: Posterior, params: Floats) -> float:
 
 
 def reject_once(
-    posterior: Posterior, params: Floats, tolerances: Sequence[float] = TOLERANCES
+    posterior: Posterior,
+    params: Floats,
+    tolerances: Sequence[float] = TOLERANCES,
+    most: float = MOST,
 ) -> Kept:
     """Reject what these parameters do not explain.
 
-    The tolerance is the least one at which most stars remain.
+    The tolerance is the least one at which no more than a share `most` of the stars is lost; with
+    the last one it is `MOST`.
     """
     residuals = _Residuals(posterior, params)
     for tolerance in tolerances:
@@ -154,7 +162,7 @@ def reject_once(
         lost = missing | ~mask[residuals.row, residuals.column]
         left = mask.any() and not residuals.none_left(missing)
         share = residuals.share(lost)
-        if left and share <= MOST:
+        if left and share <= (most if tolerance < tolerances[-1] else MOST):
             return Kept(_part(posterior, missing, mask), missing, lost, share)
     return keep_all(posterior, params)[0]
 
