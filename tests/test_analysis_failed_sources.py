@@ -1,5 +1,7 @@
 """Sources that do not fit are left out, where it is they and not the model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -82,6 +84,18 @@ def test_none_is_left_out_where_all_fit(seed):
     assert kept is posterior
     assert found is estimate
     assert not message
+
+
+def test_none_is_left_out_where_many_do_not_fit():
+    """Nine of 48, of any brightness; nor of a posterior whose maximum was not found."""
+    for rows, at_maximum, left_out in (
+        (np.arange(0, 45, 5), True, False), ([7, 30], False, False), ([7, 30], True, True),
+    ):  # fmt: skip
+        posterior = posterior_of(*blended(3, rows))
+        estimate = replace(find_map(posterior), at_maximum=at_maximum)
+        kept, _, message = leave_out_failed(posterior, estimate)
+        assert (kept is not posterior) == left_out
+        assert bool(message) == left_out
 
 
 def test_none_is_left_out_where_the_model_is_wrong():

@@ -133,7 +133,7 @@ def test_slopes_widen_the_errors_as_the_nodes_do(scatter):
     more = covariance(np.column_stack([own, by_psf]), linalg.block_diag(known, tied)) - alone
     found = alone @ equations.covariance_of_slopes(strength)[np.ix_(moving, moving)] @ alone
     sd = np.sqrt(np.diag(more))
-    # what a solution of 1 % is off
+    # what a solution of 0.3 % is off
     np.testing.assert_allclose(found / np.outer(sd, sd), more / np.outer(sd, sd), atol=0.02)
     assert {"background", "offset_x"} < set(np.array(names)[moving])
 
@@ -232,7 +232,7 @@ def test_what_does_not_vary_is_where_its_own_equations_lead():
 
 
 def test_solutions_are_precise():
-    """To a fraction of the parameters' errors; ten times less precise ones are 0.3 away."""
+    """To a fraction of the parameters' errors; ten times less precise ones are 0.7 away."""
     posterior, estimate, start = bright_frame()
     equations = NodeEquations.of(posterior, start)
     found, exact = (

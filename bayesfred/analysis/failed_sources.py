@@ -12,6 +12,7 @@ from scipy import spatial
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.absorbed import absorbed
+from bayesfred.analysis.causes.cause import rows_named
 from bayesfred.analysis.source_tests import are_bright, source_tests
 from bayesfred.analysis.sources import fit_sources
 from bayesfred.model.posterior import Posterior
@@ -25,7 +26,6 @@ MOST = 0.1  # of the sources: where more do not fit, it is the model
 RADIUS = 7.0  # around an image that is left out, widths of it
 FAR = 0.5  # of the largest deviation
 ROUNDS = 8
-NAMED = 5
 
 
 def leave_out_failed(
@@ -61,11 +61,9 @@ def leave_out_failed(
             return posterior, estimate, ""
         kept = replace(kept, mask=kept.mask & ~_own_pixels(kept, found.params, out))
         found = find_map(kept, found.params)
-    s, rows = posterior.model.sources, np.flatnonzero(out)
-    names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in rows[:NAMED])
-    more = f" and {rows.size - NAMED} more" if rows.size > NAMED else ""
-    message = f"{rows.size} of {len(s)} sources do not fit and are left out: rows of the catalogue"
-    return kept, found, f"{message}, from 0: {names}{more}" if rows.size else ""
+    rows = rows_named(posterior.model.sources, np.flatnonzero(out))
+    message = f"{out.sum()} of {out.size} sources do not fit and are left out: {rows}"
+    return kept, found, message if out.any() else ""
 
 
 def _worst(posterior: Posterior, estimate: MapEstimate) -> Flags:

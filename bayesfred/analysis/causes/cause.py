@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 
+from bayesfred._typing import Ints
+from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.measure_psf import varying_more
 
 RICHER = 0.9  # weight of a hypothesis that contains others
 MISSING = "missing terms"
+NAMED = 5  # sources listed
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,13 @@ class Finding:
     def shares(self, other: "Finding") -> bool:
         """Whether both explain the same squares."""
         return not set(self.family.split()).isdisjoint(other.family.split())
+
+
+def rows_named(sources: SourceCatalog, rows: Ints) -> str:
+    """The first of some rows of the catalogue, with their positions."""
+    s, more = sources, ", ..." if rows.size > NAMED else ""
+    names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in rows[:NAMED])
+    return f"rows of the catalogue, from 0: {names}{more}"
 
 
 def scatter_remedy(posterior: Posterior) -> str:

@@ -18,6 +18,7 @@ from bayesfred.analysis.causes.cause import (
     Cause,
     Finding,
     psf_remedy,
+    rows_named,
 )
 from bayesfred.analysis.causes.common import REACH, RINGS, CommonPattern, common_pattern
 from bayesfred.analysis.causes.context import BRIGHT, DETECTED, Context
@@ -26,7 +27,6 @@ ENOUGH = 0.85  # of what fluxes of their own explain
 FEW = 0.2  # of the sources: more than these are not the ones to blame
 OUTLYING = 6.0  # times the typical misfit of a source as bright
 NOTICEABLE = 6.0  # standard deviations
-NAMED = 5  # sources listed
 RIM = 0.01  # chance that sources lie as far out, where terms are known to be missing
 RICHEST = 0.7  # weight of companions, which near enough are displacements, too, and other PSFs
 REJECT = "set frame.reject_outliers = true"
@@ -81,15 +81,12 @@ def single_sources(context: Context, place: Finding | None) -> Iterator[Finding]
     if 0 < wrong.sum() <= max(2, FEW * light.inside.sum()):
         # where a source is missing there is often one too many: it is imaged elsewhere
         near = np.arange(len(found.power)) < 2 * dark.sum()
-        order = np.argsort(-own)[: min(NAMED, int(wrong.sum()))]
-        s = context.posterior.model.sources
-        names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in order)
+        order = np.argsort(-own)[: wrong.sum()]
         leave_out = "leave them out" if context.rejected else REJECT
         dim = f", {dark.sum()} of them with no light at their image" if dark.any() else ""
-        more = ", ..." if wrong.sum() > len(order) else ""
         held = f"{wrong.sum()} of {light.inside.sum()} sources hold the misfit{dim}"
         cause = Cause(
-            "wrong sources", 0.0, f"{held}: rows of the catalogue, from 0: {names}{more}",
+            "wrong sources", 0.0, f"{held}: {rows_named(context.posterior.model.sources, order)}",
             f"correct their positions and fluxes, or {leave_out}",
         )  # fmt: skip
         if place is not None and place.cause.name == MISSING and _outermost(context, wrong):

@@ -19,11 +19,12 @@ from bayesfred.analysis.causes.cause import (
     Cause,
     Finding,
     psf_remedy,
+    rows_named,
     scatter_remedy,
     terms_remedy,
 )
 from bayesfred.analysis.causes.find import ranked
-from bayesfred.analysis.causes.light import FEW, NAMED
+from bayesfred.analysis.causes.light import FEW
 from bayesfred.analysis.score_tests import Lead, ScoreTests
 from bayesfred.analysis.source_tests import KINDS, SourceTests, are_bright
 from bayesfred.imaging.monomials import degree_of
@@ -144,9 +145,7 @@ def _terms(finding: Finding, leads: list[Lead], scores: ScoreTests, tests: Sourc
 def _few_sources(posterior: Posterior, failed: Ints, explained: float, are_bright: bool) -> Finding:
     """Sources that differ from the catalogue, or the brightest, which show what all have wrong."""
     s = posterior.model.sources
-    names = "; ".join(f"{k} at x, y = {s.x[k]:.1f}, {s.y[k]:.1f}" for k in failed[:NAMED])
-    more = ", ..." if failed.size > NAMED else ""
-    rows = f"rows of the catalogue, from 0: {names}{more}"
+    rows = rows_named(s, failed)
     if are_bright:
         cause = Cause(
             "PSF", 0.0,
