@@ -10,6 +10,7 @@ from scipy import stats
 
 import bayesfred as bf
 from bayesfred.analysis import source_tests
+from bayesfred.analysis.causes import hidden_causes
 from bayesfred.analysis.checks import largest_deviate
 from bayesfred.analysis.diagnostics import diagnose
 from bayesfred.analysis.residuals import Residuals, judge_residuals
@@ -311,6 +312,21 @@ def test_the_verdict_names_the_number_and_the_remedy() -> None:
     row = found.checks[found.checks["name"] == "score of psf_sigma"][0]
     assert row["value"] == pytest.approx(0.03 * SIGMA, abs=4.0 * row["sd"])
     assert abs(row["z"]) > 15.0 and "failed" in found.sources.colnames
+
+
+def test_a_number_is_named_where_many_sources_are_slightly_off() -> None:
+    """Their squares' sum, 6,900, hides none that fails; a change in the fifth digit is shown."""
+    posterior = simulated(stars(), 3)
+    z = np.where(np.arange(7) == 3, 0.0, np.full((49, 7), 5.0))
+    scores = ScoreTests(
+        ("psf_sigma",), np.array([SIGMA]), np.array([2e5]), np.array([[1e9]]), np.ones(1, bool)
+    )
+    for failed in (np.zeros(49, bool), np.arange(49) < 30):
+        tests = source_tests.SourceTests(z, failed, ())
+        first = hidden_causes(posterior, np.zeros(posterior.n_parameters), scores, tests)[0]
+        assert first.name == "PSF"
+        counts = "psf_sigma is 6 standard deviations from zero score: the counts ask for 2.0002 "
+        assert first.sentence.startswith(counts) == (not failed.any())
 
 
 def test_wrong_sources_are_listed() -> None:

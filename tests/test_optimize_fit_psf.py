@@ -12,12 +12,13 @@ from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sampl
 from bayesfred.model.kernels.psf_samples import SourceSamples
 from bayesfred.model.psf_errors import PsfErrors
 from bayesfred.optimize import psf_start
-from bayesfred.optimize.fit_psf import find_psf, solved
+from bayesfred.optimize.fit_psf import find_psf
 from bayesfred.optimize.psf_equations import PsfEquations, PsfInformation, observed
 from bayesfred.optimize.psf_levels import PsfGrid
 from bayesfred.optimize.psf_marginal import occam_factor, shared_information
 from bayesfred.optimize.psf_samples import PsfSamples
 from bayesfred.optimize.psf_start import starting_grid, starting_state
+from bayesfred.optimize.psf_turns import solved
 
 LINEAR = bf.PolynomialDistortion.polynomial(1)
 

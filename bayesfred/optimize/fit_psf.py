@@ -13,7 +13,6 @@ the distortion say where a source is). Both hold for the variation over the fiel
 """
 
 import math
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -21,34 +20,29 @@ import numpy as np
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import MeasuredPSF
-from bayesfred.imaging.psf.field import field_terms
 from bayesfred.imaging.psf.measured import check_choices
 from bayesfred.model.posterior import Posterior
 from bayesfred.model.threads import one_blas_thread
-from bayesfred.optimize.anderson import accelerated
 from bayesfred.optimize.estimate import MapEstimate
-from bayesfred.optimize.psf_equations import (
-    SECANTS,
-    STILL,
-    PsfEquations,
-    PsfState,
-    field_radius,
-)
+from bayesfred.optimize.psf_equations import PsfEquations, PsfState, field_radius
 from bayesfred.optimize.psf_levels import STRENGTH
 from bayesfred.optimize.psf_nodes import NEAR, PRECISE, NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
+from bayesfred.optimize.psf_split import split
 from bayesfred.optimize.psf_start import reach, starting_grid, starting_state, suited_grid
+from bayesfred.optimize.psf_turns import (
+    TURNS,
+    change_of,
+    how_far,
+    moved,
+    near,
+    solved,
+)
 
-TURNS = 40
 LITTLE = 0.3  # standard deviations by which a parameter may be off
 SETTLED = 0.95  # of the model error before
-CHOOSING = 8  # turns of the strengths of the prior within one
-ROUGH = 100.0  # squared standard deviations of an unknown, of a state to begin from
-EXACT = 4  # turns in which the model is taken to be exact, at the most
-PATIENCE = 6  # turns without a nearer place after which an information leads no more
-FARTHER = 10.0  # than the nearest place: there it leads no more at all
-LARGEST = 0.4  # change of the PSF in one turn, share of its peak
-DARKEST = 0.1  # of its value that a flux may fall to in one turn
+NEARBY = 3.0  # squared standard deviations of all that does not vary, beside what does
+FALLING = 0.5  # times what they were before, at the most
 DRAWS = 100
 WINGS = 21.0  # of the grid for wings
 WINGS_SEEN = 5.0  # standard deviations of light beyond the fine grid that call for a wider one
@@ -150,11 +144,11 @@ def find_psf(
         if start is not None and start.nodes is not None:
             return _measured_at_nodes(posterior, start)
         begin = start or _start(posterior, estimate, float(oversampling), degree)
-        state = _near(posterior, begin)
+        state = near(posterior, begin)
         if not state.grid.wings:
             wider = _with_wings(posterior, state)
             if _light_beyond(posterior, wider) > WINGS_SEEN:
-                state = _near(posterior, wider, exact=False)
+                state = near(posterior, wider, exact=False)
         if nodes:
             return _measured_at_nodes(posterior, state.with_nodes(nodes))
         return _measured(posterior, solved(posterior, state, exact=False))
@@ -168,7 +162,7 @@ def _start(
     if grid.oversampling == oversampling:
         return starting_state(posterior, estimate, grid)
     constant = starting_state(posterior, estimate, replace(grid, degree=0))
-    known = _near(posterior, constant)
+    known = near(posterior, constant)
     suited = suited_grid(grid, known, oversampling)
     if suited is grid and degree == 0:
         return known
@@ -178,126 +172,15 @@ def _start(
     )  # fmt: skip
 
 
-def _near(posterior: Posterior, state: PsfState, *, exact: bool = True) -> PsfState:
-    """A state near the solution, from which another search can begin."""
-    equations = solved(posterior, state, exact=exact, rough=True)
-    return _moved(posterior, equations.state, _change(equations))
-
-
-def solved(
-    posterior: Posterior, state: PsfState, *, exact: bool = True, rough: bool = False
-) -> PsfEquations:
-    """The equations where their solution is.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    state : PsfState
-        Where to begin.
-    exact : bool
-        Take the model to be exact in the first turns.
-    rough : bool
-        Be content with a state from which another search can begin.
-
-    Returns
-    -------
-    PsfEquations
-
-    Raises
-    ------
-    InputError
-        If no solution is found.
-    """
-    close = False
-    for turn in range(TURNS):
-        equations = PsfEquations.of(posterior, state, exact=exact)
-        # strengths that are iterated until they rest are the same whatever the start
-        equations = equations.with_strengths(CHOOSING if close else 1)
-        far = _far(equations)
-        close = far < (ROUGH if rough else 1.0) * equations.pull.size
-        if not exact and (far < STILL or (close and rough)):
-            return equations
-        if close and not exact:
-            equations = _followed(posterior, equations)
-        state = _moved(posterior, equations.state, _change(equations))
-        # a model error that came first would explain what a PSF too smooth leaves
-        exact = exact and not close and turn + 1 < EXACT
-    raise InputError(
-        f"psf: no PSF found in {TURNS} turns: expected a start that resembles it: fit the width "
-        "first (nuisances: psf_sigma), or begin from another PSF"
-    )
-
-
-def _far(equations: PsfEquations) -> float:
-    """The step's squared length, in standard deviations of all unknowns together."""
-    return float(equations.measured @ equations.measured)
-
-
-def _followed(posterior: Posterior, equations: PsfEquations) -> PsfEquations:
-    """The equations where their information and strengths lead, or nearest to it.
-
-    Weights follow the light, and fluxes and positions the PSF: steps turn back or lag behind.
-    """
-    best, points, since = equations, deque[tuple[Floats, Floats, Floats]](maxlen=SECANTS), 0
-    nearest = _far(best)
-    while since < PATIENCE:
-        points.append((_place(equations.state), _change(equations), equations.measured))
-        state = _moved(posterior, equations.state, accelerated(points))
-        equations = PsfEquations.of(posterior, state, known=equations)
-        far = _far(equations)
-        since += 1
-        if far < nearest:
-            best, nearest, since = equations, far, 0
-        if far < STILL or not far < FARTHER * nearest:
-            break
-    return best
-
-
-def _place(state: PsfState) -> Floats:
-    """All that a step changes: deviations, parameters, fluxes and shifts."""
-    own = np.column_stack([state.fluxes, state.shifts])
-    return np.concatenate([state.deviations, state.params, own.ravel()])
-
-
-def _change(equations: PsfEquations) -> Floats:
-    """The step as a change of all these."""
-    information, step = equations.information, equations.step
-    own = np.zeros(3 * equations.state.fluxes.size)
-    own[information.which] = equations.own_step - information.response @ step
-    return np.concatenate([step, own])
-
-
-def _moved(posterior: Posterior, state: PsfState, change: Floats) -> PsfState:
-    """The state after a change, or as much of it as leaves the PSF recognisable."""
-    size, unknowns = state.deviations.size, state.deviations.size + state.params.size
-    wider = state.grid.combined(np.concatenate([np.zeros(state.grid.fixed), change[:size]]))
-    peak = np.abs(state.grid.combined(state.coefficients)[0]).max()
-    s = posterior.model.sources
-    terms = field_terms(s.x, s.y, state.grid.degree, field_radius(posterior))
-    terms = np.unique(terms, axis=0)  # one row where nothing varies
-    largest = float(np.abs(terms @ wider.reshape(len(wider), -1)).max())
-    change = change * min(1.0, LARGEST * peak / max(largest, 1e-300))
-    params, fluxes = state.params + change[size:unknowns], state.fluxes.copy()
-    own = change[unknowns:].reshape(-1, 3)
-    names = posterior.parameter_names
-    if "flux_scale" in names:
-        k = names.index("flux_scale")
-        params[k] = max(params[k], DARKEST * state.params[k])
-        fluxes *= params[k] / state.params[k]
-    fluxes = np.maximum(fluxes + own[:, 0], DARKEST * fluxes)
-    shifts = state.shifts + own[:, 1:]
-    coefficients = state.deviating(state.deviations + change[:size])
-    return replace(state, coefficients=coefficients, params=params, fluxes=fluxes, shifts=shifts)
-
-
 def _light_beyond(posterior: Posterior, state: PsfState) -> float:
     """By how many standard deviations light that falls as r^-4 lies between fine grid and wings."""
     radius, wings = state.grid.fine_radius, state.grid.wings
     data = PsfSamples.at(posterior, state.params, state.shifts, wings)
-    r2 = data.samples.a**2 + data.samples.b**2
+    farther = (data.samples.a**2 + data.samples.b**2) / radius**2
     bright = state.fluxes[data.samples.source]
-    wing = data.image(np.where(r2 > radius**2, bright * (radius**2 / r2) ** 2, 0.0))
-    beyond = data.image(np.asarray(r2 <= radius**2, dtype=np.float64)) == 0.0
+    falling = bright / np.maximum(farther, 1.0) ** 2
+    wing = data.image(np.where(farther > 1.0, falling, 0.0))
+    beyond = data.image(np.asarray(farther <= 1.0, dtype=np.float64)) == 0.0
     residual, variance = data.residual(posterior, state.params, np.zeros(len(wing)))
     weight = np.where(beyond, 1.0 / variance, 0.0)
     wing = wing - (weight @ wing / weight.sum() if beyond.any() else 0.0)  # of any background
@@ -345,15 +228,10 @@ def _measured_at_nodes(
 ) -> tuple[MeasuredPSF, PsfState, Floats]:
     """The PSF that varies between nodes, its state, and no draws: the nodes' errors are theirs.
 
-    What does not vary, and the background, take a step of their own: where the search began they
+    What does not vary, and the background, take steps of their own: where the search began they
     stand for what varies, too.
     """
-    assert state.nodes is not None, "the PSF varies between them"
-    if not state.nodes.coefficients.any():
-        state = _at_nodes(posterior, state, NEAR)[0]
-    shared = PsfEquations.of(posterior, state).with_strengths(1)
-    state = _moved(posterior, shared.state, _change(shared))
-    state, equations = _at_nodes(posterior, state, PRECISE)
+    state, equations = _in_turns(posterior, _in_turns(posterior, state, NEAR)[0], PRECISE)
     nodes = state.nodes
     assert nodes is not None, "it has as many as before"
     every = state.grid.combined(state.coefficients, nodes.coefficients)
@@ -373,6 +251,26 @@ def _measured_at_nodes(
     return psf, state, np.zeros((0, state.deviations.size))
 
 
+def _in_turns(
+    posterior: Posterior, state: PsfState, precise: float
+) -> tuple[PsfState, NodeEquations]:
+    """The state where the nodes, and what does not vary, are found in turns; the nodes' equations.
+
+    Turns that come no nearer, for their weights change, end where they were nearest.
+    """
+    found = best = _at_nodes(posterior, state, precise)
+    nearest = math.inf
+    while True:
+        shared = PsfEquations.of(posterior, split(found[0])).with_strengths(1)
+        far = how_far(shared)
+        best = found if far < nearest else best
+        if far < NEARBY or far > FALLING * nearest:
+            return best
+        nearest = far
+        state = split(moved(posterior, shared.state, change_of(shared)))
+        found = _at_nodes(posterior, state, precise)
+
+
 def _at_nodes(
     posterior: Posterior, state: PsfState, precise: float
 ) -> tuple[PsfState, NodeEquations]:
@@ -388,7 +286,7 @@ def _at_nodes(
                 return replace(state, nodes=nodes), equations
             now = precise
         every = np.concatenate([np.zeros_like(state.deviations), change])
-        state = _moved(posterior, replace(state, nodes=nodes), every)
+        state = moved(posterior, replace(state, nodes=nodes), every)
     raise InputError(
         f"psf: no PSF found in {TURNS} turns between {nodes.number} x {nodes.number} nodes: "
         "expected sources at most of them: set fewer nodes"

@@ -2,8 +2,8 @@
 
 The start's spline c0 is kept, and deviations from it are looked for on two grids: a fine one for
 the PSF at the field's middle, and one twice as coarse, whose splines are exact sums of finer ones,
-for its variation over the field. A third one, eight times as coarse and three times as wide, is for
-wings that the fine one cannot hold.
+for its variation over the field. A third one, eight times as coarse (or four times, where sources
+leave little room) and three times as wide, is for wings that the fine one cannot hold.
 
 Before the counts speak, a block of deviations (a grid and a term of the field) is a smooth function
 within an envelope E(r), which falls off as a PSF's wings do, or a pedestal under every star could
@@ -30,6 +30,7 @@ from bayesfred.model.kernels.psf_normal import Levels, halved
 
 AMPLITUDE = 0.03  # 1 over the square of the 6 knots in a FWHM: a bump of that size is E high
 STRENGTH = 100.0  # to begin with
+LEAST_WINGS = 6  # knots of the grid for wings along a radius
 LIMITS = (1e-3, 1e6)  # of a strength: the evidence would take a good start for exact
 
 
@@ -107,7 +108,9 @@ class PsfGrid:
         if terms > 1:
             rows.append((2, self.fine_radius, 1, terms))
         if self.wings:
-            rows.append((8, self.wings, 0, 1))
+            # its splines end there, where the background begins
+            times = 8 if self.wings * self.oversampling > 8 * LEAST_WINGS else 4
+            rows.append((times, self.wings - 2.5 * times / self.oversampling, 0, 1))
         h = np.array([times / self.oversampling for times, *_ in rows])
         side = np.array(
             [2 * round(radius / step) + 1 for step, (_, radius, *_) in zip(h, rows, strict=True)]
