@@ -84,7 +84,7 @@ def calibrate(name: str, *, map_only: bool = True, folder: Path = Path("chains")
     run_file = HERE / f"startracker_sky_{name}.toml"
     result = bf.commands.fit(run_file, map_only=map_only, overwrite=True, say=print)
     print(result.diagnostics.message)
-    header = sip(bf.Calibration.from_chain(result.chain), 3)
+    header = sip(bf.Calibration.from_chain(result.chain), 5)
     header.write(folder / f"startracker_sky_{name}.header.fits", overwrite=True)
     run = settings.read_settings(run_file)
     stars = Table.read(resolve(run.catalogue.path or "", run_file, must_exist=True))

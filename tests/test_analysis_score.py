@@ -318,15 +318,16 @@ def test_a_number_is_named_where_many_sources_are_slightly_off() -> None:
     """Their squares' sum, 6,900, hides none that fails; a change in the fifth digit is shown."""
     posterior = simulated(stars(), 3)
     z = np.where(np.arange(7) == 3, 0.0, np.full((49, 7), 5.0))
+    tests = source_tests.SourceTests(z, np.zeros(49, bool), ())
     scores = ScoreTests(
-        ("psf_sigma",), np.array([SIGMA]), np.array([2e5]), np.array([[1e9]]), np.ones(1, bool)
-    )
-    for failed in (np.zeros(49, bool), np.arange(49) < 30):
-        tests = source_tests.SourceTests(z, failed, ())
-        first = hidden_causes(posterior, np.zeros(posterior.n_parameters), scores, tests)[0]
-        assert first.name == "PSF"
-        counts = "psf_sigma is 6 standard deviations from zero score: the counts ask for 2.0002 "
-        assert first.sentence.startswith(counts) == (not failed.any())
+        ("psf_sigma", "background_u"), np.array([SIGMA, 0.0]), np.array([2e5, 10.0]),
+        np.diag([1e9, 4.0]), np.ones(2, bool),
+    )  # fmt: skip
+    causes = hidden_causes(posterior, np.zeros(posterior.n_parameters), scores, tests)
+    assert [cause.name for cause in causes] == ["PSF", "background"]
+    assert [cause.share for cause in causes] == pytest.approx([40.0 / 65.0, 25.0 / 65.0])
+    sentence = "psf_sigma is 6 standard deviations from zero score: the counts ask for 2.0002 in"
+    assert causes[0].sentence.startswith(sentence)
 
 
 def test_wrong_sources_are_listed() -> None:

@@ -369,6 +369,19 @@ def test_the_psf_leaves_pixels_that_tell_the_background():
     assert radii[1] > 6.5  # the middle between four stars is 8.5 pixels from them
 
 
+@pytest.mark.parametrize("wings", [7.0, 8.54, 11.3, 15.0, 30.0])
+def test_wings_end_where_pixels_tell_the_background(wings):
+    """To half a knot; the equations see all of them along an axis."""
+    grid = PsfGrid(4.0, 1.5, 0, 6.0, wings)
+    c, level = np.zeros(grid.conventions.shape[1]), grid.levels
+    c[level.start[-1] :] = 1.0
+    psf = bf.MeasuredPSF(grid.combined(c), grid.oversampling, 100.0)
+    a = np.arange(0.0, 40.0, 0.01)
+    last = a[psf.density(a, 0.0) > 1e-9 * psf.density(0.0, 0.0)].max()
+    assert last <= grid.radius < last + 0.05
+    assert abs(last - wings) < 0.5 * level.spacing[-1] + 0.05
+
+
 def test_what_a_psf_adds_is_that_of_a_joint_fit():
     """Against Schur's complement, of a posterior that is normal in parameters and PSF."""
     rng = np.random.default_rng(3)

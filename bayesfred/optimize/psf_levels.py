@@ -97,8 +97,11 @@ class PsfGrid:
 
     @property
     def radius(self) -> float:
-        """Distance from the middle that the grids cover, pixel."""
-        return max(self.wings, self.fine_radius)
+        """Distance from the middle that the grids cover, and the splines of wings; pixel."""
+        if not self.wings:
+            return self.fine_radius
+        last = 0.5 * (float(self.levels.side[-1]) + 3.0) * float(self.levels.spacing[-1])
+        return max(last, self.fine_radius)
 
     @cached_property
     def levels(self) -> Levels:
@@ -108,9 +111,9 @@ class PsfGrid:
         if terms > 1:
             rows.append((2, self.fine_radius, 1, terms))
         if self.wings:
-            # its splines end there, where the background begins
+            # its splines end about there, where the background begins
             times = 8 if self.wings * self.oversampling > 8 * LEAST_WINGS else 4
-            rows.append((times, self.wings - 2.5 * times / self.oversampling, 0, 1))
+            rows.append((times, self.wings - 2.0 * times / self.oversampling, 0, 1))
         h = np.array([times / self.oversampling for times, *_ in rows])
         side = np.array(
             [2 * round(radius / step) + 1 for step, (_, radius, *_) in zip(h, rows, strict=True)]

@@ -106,9 +106,10 @@ def hidden_causes(
         some = others[:, KINDS[kind]]
         explained = float(some.sum()) - NOISE * (2.0 * some.size) ** 0.5 - taken
         findings.append(Finding(cause, explained, spread.name, RICHER))
-    most = max((finding.explained for finding in findings), default=0.0)
+    parts = [finding.explained for finding in findings]
+    every = sum(max(part, 0.0) for part in parts)
     # many sources that are slightly off, none so that it fails, hide no test that does
-    return ranked(findings, max(float(own.sum()), most)) or ranked(findings, most)
+    return ranked(findings, max([float(own.sum()), *parts])) or ranked(findings, every)
 
 
 def _by_remedy(leading: tuple[Lead, ...]) -> dict[tuple[str, str], list[Lead]]:
