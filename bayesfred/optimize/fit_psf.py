@@ -30,14 +30,7 @@ from bayesfred.optimize.psf_nodes import NEAR, PRECISE, NodeEquations
 from bayesfred.optimize.psf_samples import PsfSamples
 from bayesfred.optimize.psf_split import split
 from bayesfred.optimize.psf_start import reach, starting_grid, starting_state, suited_grid
-from bayesfred.optimize.psf_turns import (
-    TURNS,
-    change_of,
-    how_far,
-    moved,
-    near,
-    solved,
-)
+from bayesfred.optimize.psf_turns import TURNS, change_of, how_far, moved, near, solved
 
 LITTLE = 0.3  # standard deviations by which a parameter may be off
 SETTLED = 0.95  # of the model error before

@@ -10,13 +10,7 @@ from bayesfred.errors import InputError
 from bayesfred.imaging.psf.field import field_terms
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.anderson import accelerated
-from bayesfred.optimize.psf_equations import (
-    SECANTS,
-    STILL,
-    PsfEquations,
-    PsfState,
-    field_radius,
-)
+from bayesfred.optimize.psf_equations import SECANTS, STILL, PsfEquations, PsfState, field_radius
 
 TURNS = 40
 CHOOSING = 8  # turns of the strengths of the prior within one
