@@ -26,7 +26,14 @@ from .imaging.logarithm import LogDistortion
 from .imaging.psf import GaussianPSF, MeasuredPSF, MoffatPSF, SampledPSF
 from .model.drift import Drift
 from .model.joint import JointPosterior
-from .model.noise import BackgroundNoise, FlatFieldNoise, GaussianNoise, PoissonNoise, simulate
+from .model.noise import (
+    BackgroundNoise,
+    FlatFieldNoise,
+    GaussianNoise,
+    PoissonNoise,
+    SubtractedNoise,
+    simulate,
+)
 from .model.parameters import Nuisances
 from .model.posterior import Posterior
 from .optimize.estimate import MapEstimate
@@ -35,6 +42,7 @@ from .optimize.fit_psf import fit_psf
 from .optimize.follow import follow_images
 from .optimize.grid_marks import invert_dots
 from .optimize.grid_target import GridImage, GridTarget, index_grid
+from .optimize.local_background import subtract_background
 from .optimize.measure_psf import marginalize_psf, measure_psf
 from .optimize.uncatalogued import UncataloguedSources, find_uncatalogued
 from .sampling.chain import Chain
@@ -86,6 +94,7 @@ __all__ = [
     "SampledPSF",
     "SelfCalibration",
     "SourceCatalog",
+    "SubtractedNoise",
     "TermChoice",
     "UncataloguedSources",
     "choose_terms",
@@ -120,4 +129,5 @@ __all__ = [
     "show",
     "simulate",
     "simulation_based_calibration",
+    "subtract_background",
 ]

@@ -152,6 +152,11 @@ def posterior_given(
 ) -> Posterior:
     """The posterior of a frame with the nuisances and priors of the run file."""
     nuisances, prior = run.nuisances.make(), priors_given(run)
+    if run.frame.background_scale is not None and nuisances.footprint is None:
+        raise InputError(
+            "frame.background_scale: got it without nuisances.footprint, expected both: the "
+            "background is measured outside the footprints"
+        )
     if isinstance(model.psf, PSFToMeasure):  # its width is looked for first, its error last
         nuisances = replace(nuisances, psf_sigma=True, model_error=False)
         prior.pop("model_error", None)

@@ -349,6 +349,19 @@ def test_the_error_of_bright_sources_goes_with_the_root_and_of_faint_ones_with_t
     assert 3.0 < factor < 3.5
 
 
+def test_sources_about_the_middle_alone_tell_of_the_whole_field() -> None:
+    """A single point is among them, where f = f_ux u x is known to be zero."""
+    sources = bf.SourceCatalog([-5.0, -5.0, 5.0, 5.0], [-5.0, 5.0, -5.0, 5.0], np.full(4, 1e5))
+    model = bf.ForwardModel(
+        bf.Detector((120, 120)), sources, bf.GaussianPSF(2.0),
+        bf.PolynomialDistortion([(1, 0, 1, 0)], [(0, 1, 0, 1)]),
+    )  # fmt: skip
+    params = np.array([1e-4, 1e-4, 2.0])
+    posterior = bf.Posterior(model, bf.simulate(model, params[:2], 2.0, seed=1))
+    assert error_now(posterior, params) > 0.01
+    assert 1.0 < photons_needed(posterior, params, 0.01).factor < math.inf
+
+
 @pytest.mark.parametrize(
     "nuisances",
     [

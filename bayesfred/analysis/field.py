@@ -41,6 +41,7 @@ __all__ = [
 ]
 
 POINTS = 21  # of the grid along the frame's longer side, from edge to edge
+FEWEST = 4  # of them among the sources, or all of them count
 
 
 class FieldPoints(NamedTuple):
@@ -161,7 +162,7 @@ def field_points(posterior: Posterior, params: Floats) -> FieldPoints:
     inside = inside_hull(hull, u, v)
     edge_u, edge_v = (np.isin(np.arange(n), (0, n - 1)) for n in (columns, rows))
     weights = np.where(edge_u, 0.5, 1.0) * np.where(edge_v, 0.5, 1.0)[:, None]
-    return FieldPoints(u, v, hull, inside, weights * inside if inside.any() else weights)
+    return FieldPoints(u, v, hull, inside, weights * inside if inside.sum() >= FEWEST else weights)
 
 
 def displacement_covariance(

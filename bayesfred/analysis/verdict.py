@@ -15,6 +15,7 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.causes import Cause, correlated_pixels, find_causes, hidden_causes
 from bayesfred.analysis.causes.cause import psf_remedy
 from bayesfred.analysis.residuals import Residuals
+from bayesfred.model.noise import SubtractedNoise
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
@@ -311,6 +312,8 @@ def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
     left_out += ["its fluxes"] if nuisances.flux == "fixed" else []
     if not nuisances.model_error:
         left_out.append("the PSF's shape" if nuisances.psf_sigma else "the PSF")
+    if isinstance(posterior.noise, SubtractedNoise):
+        left_out.append("the background that was subtracted")
     left_out += ["the choice of terms"]
     sentence = f"The error bars leave out errors of {_listed(left_out)}"
     factor = (max(fit["pearson"], 0.0) / max(fit["pearson_expected"], 1.0)) ** 0.5

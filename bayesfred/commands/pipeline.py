@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesfred import build, settings
+from bayesfred._typing import Floats
 from bayesfred.analysis.causes import find_causes
 from bayesfred.analysis.choose_terms import choose_terms
 from bayesfred.analysis.failed_sources import leave_out_failed
@@ -32,6 +33,7 @@ from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, rej
 from bayesfred.optimize.follow import followed_images
 from bayesfred.optimize.hot_pixels import hot_pixels, pixels_named
 from bayesfred.optimize.image_widths import image_widths
+from bayesfred.optimize.local_background import subtract_background
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.outliers import BREAKDOWN, share_lost
 from bayesfred.optimize.uncatalogued import find_uncatalogued
@@ -40,6 +42,7 @@ from bayesfred.sources import bright, find_sources
 
 __all__ = ["doubted", "fit_frame", "read_doubted", "read_frame"]
 
+DARKEST = 1e-3  # counts per pixel of a background to begin with
 ANOTHER = 2.0  # times the frame's own width: a start that is farther off is not used
 
 
@@ -154,7 +157,7 @@ def read_doubted(
         estimate, rough = None, isinstance(psf, PSFToMeasure)
         if posterior.nuisances.footprint is not None:
             with working(show=say is not None):
-                posterior, estimate, lines = _follow(posterior, rough=rough)
+                posterior, estimate, lines = _follow(posterior, f.background_scale, rough=rough)
             note(*lines)
         given = posterior
         if f.reject_outliers:
@@ -215,7 +218,9 @@ def _by_its_peaks(
     return psf, frame, lines
 
 
-def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimate, list[str]]:
+def _follow(
+    posterior: Posterior, scale: float | None, *, rough: bool
+) -> tuple[Posterior, MapEstimate, list[str]]:
     """Footprints around the images, without sources that the catalogue lacks; the maximum."""
     followed, near = followed_images(posterior)
     shared = int(np.sum(followed.mask & posterior.mask))
@@ -224,6 +229,16 @@ def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimat
         "near to the catalogue's positions"
     ]
     estimate = approach(followed, near)[1] if rough else find_map(followed)
+    if scale is not None:
+        even = subtract_background(followed, estimate, scale)
+        light = followed.counts - even.counts
+        start = _darker(followed, estimate.params, light)
+        estimate = approach(even, start)[1] if rough else find_map(even, start)
+        lines.append(
+            f"background: structure of up to {light[even.mask].max():.3g} counts a pixel, measured "
+            f"outside the footprints at every {scale:g} pixels, subtracted"
+        )
+        followed = even
     found = find_uncatalogued(followed, estimate)
     if lost := int(np.sum(followed.mask & ~found.mask)):
         lines.append(f"{found.message}; {lost} pixels masked")
@@ -231,6 +246,15 @@ def _follow(posterior: Posterior, *, rough: bool) -> tuple[Posterior, MapEstimat
         start = estimate.params
         estimate = approach(followed, start)[1] if rough else find_map(followed, start)
     return followed, estimate, lines
+
+
+def _darker(posterior: Posterior, params: Floats, light: Floats) -> Floats:
+    """Parameters whose background is a constant: about what it is without some light."""
+    rest = (posterior.likelihood.background(params) - light)[posterior.mask].mean()
+    terms = [name.startswith("background") for name in posterior.parameter_names]
+    darker = np.where(terms, 0.0, params)
+    darker[posterior.parameter_names.index("background")] = max(rest, DARKEST)
+    return darker
 
 
 def _with_measured_psf(

@@ -40,6 +40,9 @@ class FrameSettings(Section):
         Pixels where it is not between 0.01 and 100, such as dead ones, are masked.
     variance : str, optional, e-^2
         The file of a map of the read-out's variance, whose root is the read noise.
+    background_scale : float, optional, recorded pixel
+        At every so many pixels the structure of the background is measured outside the footprints;
+        it is subtracted, see `bayesfred.subtract_background`. By default nothing is.
     reject_outliers : bool
         Whether unmatched sources and spurious detections are left out, see
         `bayesfred.reject_outliers`, and hot pixels before anything is searched for. At the maximum
@@ -55,6 +58,7 @@ class FrameSettings(Section):
     gain_map: Name | None = None
     flat: Name | None = None
     variance: Name | None = None
+    background_scale: Positive | None = None
     reject_outliers: bool = False
 
     @property

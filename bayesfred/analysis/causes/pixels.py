@@ -8,11 +8,11 @@ import numpy as np
 from scipy import ndimage
 
 from bayesfred._typing import Flags, Floats
+from bayesfred.analysis.causes.background import background_between, background_outside
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.common import common_pattern
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
-from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, MOST_ORDER
 from bayesfred.model.noise import PoissonNoise
 
 FEWEST_FULL = 3  # equal pixels at the top that are a pile
@@ -26,7 +26,6 @@ AROUND = 9  # lines, among which one is compared
 FEW_LINES = 0.05  # of the lines: more than these are all
 NAMED = 5  # lines listed
 LINES = "rows or columns"
-TILES_A_TERM = 2  # at least, for a polynomial to be tried
 STEEPEST = (
     30.0  # times the background's, to which noise in proportion to the counts is extrapolated
 )
@@ -190,13 +189,14 @@ def _independent(context: Context) -> Iterator[Finding]:
     """The same of pixels that share no noise."""
     mean, scatter, size, place = _tiles(context)
     if mean.size < FEWEST_TILES:
+        yield from background_outside(context)
         return
     order = np.argsort(scatter)
     kept = order[mean.size // 10 : mean.size - mean.size // 10]
     ratio = float(np.average(scatter[kept], weights=size[kept]))
     ratio = max(ratio / _level(context), 1e-9)
     everywhere = context.used.sum() / max(size.sum(), 1)
-    yield from _background(context, (mean, size, place), ratio, float(everywhere))
+    yield from background_between(context, (mean, size, place), ratio, float(everywhere))
     sd = (2.0 / size[kept].sum()) ** 0.5 * _tail(context)
     if abs(ratio - 1.0) > NOTICEABLE * max(sd, 1e-9) + 0.02:
         yield _noise(context, ratio)
@@ -233,49 +233,6 @@ def _tiles(context: Context) -> tuple[Floats, Floats, Floats, Floats]:
     scatter = (averaged(z**2) - mean**2) * n / (n - 1.0)
     u, v = averaged(column / max(nx - 1, 1) * 2.0 - 1.0), averaged(row / max(ny - 1, 1) * 2.0 - 1.0)
     return mean, scatter, n, np.stack([u, v])
-
-
-def _background(
-    context: Context, tiles: tuple[Floats, Floats, Floats], ratio: float, everywhere: float
-) -> Iterator[Finding]:
-    """A background that is not the polynomial that was fitted."""
-    mean, size, _ = tiles
-    squares = float(np.sum(size * mean**2))
-    if not _noticed(squares, ratio, mean.size):
-        return
-    held = squares - ratio * mean.size
-    mending = _mending_order(context.posterior.nuisances.background_order, tiles, ratio)
-    excess = held / float(np.sum(size))  # of what the noise of so few pixels makes of the means
-    by = float((excess * np.median(context.variance[context.used])) ** 0.5)
-    cause = Cause(
-        "background", 0.0,
-        f"the background between the sources differs from the model's by {by:.2g} counts a pixel "
-        "(root mean square), from one part of the frame to another",
-        f"set nuisances.background_order = {mending}" if mending else
-        "subtract a background first, or mask what is not background",
-    )  # fmt: skip
-    yield Finding(cause, held * everywhere, "background")
-
-
-def _mending_order(order: int, tiles: tuple[Floats, Floats, Floats], ratio: float) -> int | None:
-    """The least order, above the one that was fitted, that leaves nothing to notice."""
-    mean, size, (u, v) = tiles
-    root = np.sqrt(size)
-    for more in range(order + 1, MOST_ORDER + 1):
-        powers = BACKGROUND_POWERS[: math.comb(more + 2, 2)]
-        if mean.size < TILES_A_TERM * len(powers):
-            break
-        design = np.stack([u**m * v**n for m, n in powers], axis=1) * root[:, None]
-        found, *_ = np.linalg.lstsq(design, mean * root, rcond=None)
-        left = float(np.sum((mean * root - design @ found) ** 2))
-        if not _noticed(left, ratio, mean.size - len(powers)):
-            return more
-    return None
-
-
-def _noticed(squares: float, ratio: float, number: int) -> bool:
-    """Whether squares of that sum are more than chance, given their mean by chance."""
-    return squares > ratio * (number + NOTICEABLE * math.sqrt(2.0 * number))
 
 
 def _noise(context: Context, ratio: float) -> Finding:

@@ -9,6 +9,7 @@ from bayesfred.model.noise.model_error import ModelErrorNoise, model_error_terms
 from bayesfred.model.noise.poisson import PoissonNoise
 from bayesfred.model.noise.protocol import Noise
 from bayesfred.model.noise.simulation import simulate
+from bayesfred.model.noise.subtracted import SubtractedNoise
 
 __all__ = [
     "BackgroundNoise",
@@ -17,6 +18,7 @@ __all__ = [
     "ModelErrorNoise",
     "Noise",
     "PoissonNoise",
+    "SubtractedNoise",
     "model_error_terms",
     "simulate",
 ]
