@@ -23,7 +23,7 @@ SCALE = 5.0
 
 
 def surface(counts: Floats, outside: NDArray[np.bool_], scale: float = SCALE) -> Floats:
-    return local_background._surface(counts, outside, bf.PoissonNoise(1.0), scale)
+    return local_background._smooth(counts, outside, bf.PoissonNoise(1.0), scale)
 
 
 def holes(shape: tuple[int, int], radius: float, apart: float) -> NDArray[np.bool_]:
@@ -150,6 +150,25 @@ def test_the_verdict_names_the_remedy_which_cures() -> None:
     assert causes[0].name == "background" and "narrow frame.background_scale" in causes[0].remedy
 
 
+@pytest.mark.slow
+def test_what_no_polynomial_follows_is_told_before_the_fit(tmp_path: Path) -> None:
+    for strength, told in ((60.0, True), (0.0, False)):
+        posterior = bf.follow_images(haunted(4, strength))
+        line = local_background.background_message(posterior, bf.find_map(posterior).params)
+        assert bool(re.search(r"frame.background_scale = [78]", line)) == told, line
+    # nothing is beside the footprints, or there is one source
+    everywhere = replace(posterior, mask=posterior.valid)
+    params = bf.find_map(everywhere).params
+    assert local_background.background_message(everywhere, params) == ""
+    # a chain file has the pixels outside the footprints, too, and so the same cause
+    posterior = bf.follow_images(haunted(1))
+    bf.laplace(posterior, bf.find_map(posterior), path=tmp_path / "one.h5", draws=20, seed=1)
+    chain = bf.open_chain(tmp_path / "one.h5")
+    again = chain.posterior()
+    np.testing.assert_array_equal(again.valid, posterior.valid)
+    assert bf.find_causes(again, chain.estimate.params)[0].name == "background"
+
+
 def test_gaussian_noise_stays_what_it_is() -> None:
     posterior = replace(haunted(2), noise=bf.GaussianNoise(30.0))
     even = bf.subtract_background(posterior, bf.find_map(posterior), SCALE)
@@ -187,6 +206,10 @@ def test_run_file(tmp_path: Path, kind: str) -> None:
     assert isinstance(posterior.noise, bf.SubtractedNoise)
     light = posterior.noise.light[posterior.mask]
     assert light.min() == 0.0 and 35.0 < light.max() < 60.0
+    # without it the line that proposes it
+    run.write_text(text.replace("background_scale = 6.0\n", ""))
+    output = invoke(tmp_path, "fit", "run.toml", "--map-only", "--overwrite")
+    assert "background: outside the footprints it differs from the model's by" in output.stdout
     # without footprints there is nowhere to measure it
     run.write_text(text.replace("footprint = 7.0", ""))
     output = invoke(tmp_path, "fit", "run.toml", "--map-only", "--overwrite")

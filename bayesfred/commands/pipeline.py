@@ -33,7 +33,7 @@ from bayesfred.optimize.find_map import MOSTLY_REJECTED, approach, find_map, rej
 from bayesfred.optimize.follow import followed_images
 from bayesfred.optimize.hot_pixels import hot_pixels, pixels_named
 from bayesfred.optimize.image_widths import image_widths
-from bayesfred.optimize.local_background import subtract_background
+from bayesfred.optimize.local_background import background_message, subtract_background
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.outliers import BREAKDOWN, share_lost
 from bayesfred.optimize.uncatalogued import find_uncatalogued
@@ -239,6 +239,8 @@ def _follow(
             f"outside the footprints at every {scale:g} pixels, subtracted"
         )
         followed = even
+    else:
+        lines.append(background_message(followed, estimate.params))
     found = find_uncatalogued(followed, estimate)
     if lost := int(np.sum(followed.mask & ~found.mask)):
         lines.append(f"{found.message}; {lost} pixels masked")

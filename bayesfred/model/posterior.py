@@ -93,7 +93,7 @@ class Posterior(FrameDensity):
     mask: Flags
     nuisances: Nuisances
     extrapolation: Extrapolation | Around | None = field(metadata={"stored": False})
-    valid: Flags = field(metadata={"stored": False})
+    valid: Flags = field(metadata={"since": 9})
     psf_errors: PsfErrors | None = field(metadata={"since": 6})
 
     def __init__(

@@ -17,9 +17,10 @@ penalised splines on large grids.
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import ndimage, sparse, spatial
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import cg
 
@@ -37,6 +38,7 @@ from bayesfred.optimize.estimate import MapEstimate
 
 DEGREE = 3  # of the splines
 BAND = 2 * DEGREE + 1  # splines that overlap one, along an axis
+NOTICEABLE = 5.0  # standard deviations of the sum of squares
 UNLIT = 0.2  # of the lowest background in use
 AROUND = 7  # pixels a side of a square
 STIFF = 0.5  # of the scale, over which the surface does not bend
@@ -98,7 +100,7 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
             f"background_scale: got {type(noise).__name__}, whose variance would change with what "
             "is subtracted, expected PoissonNoise, FlatFieldNoise or GaussianNoise"
         )
-    level = background_surface(posterior, estimate.params, scale)
+    level = _surface(posterior, estimate.params, scale)
     lowest = max(float(level[posterior.mask].min()), 0.0)
     light = np.maximum(level - lowest, 0.0)
     if not isinstance(noise, GaussianNoise):
@@ -106,26 +108,73 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
     return replace(posterior, counts=posterior.counts - light, noise=noise, extrapolation=None)
 
 
-def background_surface(posterior: Posterior, params: Floats, scale: float) -> Floats:
-    """The background that the pixels outside the footprints tell, everywhere, shape (ny, nx).
+class Structure(NamedTuple):
+    """What the pixels outside the footprints show beyond a posterior's background.
+
+    Attributes
+    ----------
+    scale : float, pixel
+        Half the distance between neighbouring images: no finer structure is seen between them.
+    counts : ndarray, shape (ny, nx), counts per pixel
+    """
+
+    scale: float
+    counts: Floats
+
+
+def structure_outside(posterior: Posterior, params: Floats) -> Structure | None:
+    """The structure of the background outside the footprints, if there are pixels that tell it.
 
     Parameters
     ----------
     posterior : Posterior
     params : ndarray, shape (d,)
-    scale : float, pixel
 
     Returns
     -------
-    ndarray, shape (ny, nx), counts per pixel
-
-    Raises
-    ------
-    InputError
-        If the scale is too small for the frame; if too few pixels lie outside the footprints.
+    Structure or None
     """
-    outside = posterior.valid & ~posterior.mask & _lit(posterior, params)
-    return _surface(posterior.counts, outside, posterior.noise, scale)
+    images = posterior.likelihood.image_positions(params) / posterior.model.detector.binning
+    half = 0.5 * np.array(posterior.mask.shape[::-1])
+    images = images[(np.abs(images) <= half).all(axis=1)]
+    if len(images) < 2 or np.array_equal(posterior.valid, posterior.mask):
+        return None
+    apart = spatial.cKDTree(images).query(images, 2)[0][:, 1]
+    scale = float(f"{max(0.5 * np.median(apart), 1.0):.2g}")
+    try:
+        level = _surface(posterior, params, scale)
+    except InputError:  # too few pixels, or too many splines
+        return None
+    return Structure(scale, level - posterior.likelihood.background(params))
+
+
+def background_message(posterior: Posterior, params: Floats) -> str:
+    """Say in a line how the background outside the footprints differs, where that would matter.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    params : ndarray, shape (d,)
+
+    Returns
+    -------
+    str
+        Empty where the sum of squares over the pixels in use would hardly show it.
+    """
+    found = structure_outside(posterior, params)
+    if found is None:
+        return ""
+    used, level = posterior.mask, params[posterior.parameter_names.index("background")]
+    mean = posterior.expected_counts(params)
+    weight = 1.0 / posterior.noise_at(params).counts_variance(mean, level)[used]
+    counts = found.counts[used] - np.average(found.counts[used], weights=weight)
+    if not np.sum(weight * counts**2) > NOTICEABLE * (2.0 * counts.size) ** 0.5:
+        return ""
+    return (
+        f"background: outside the footprints it differs from the model's by {counts.std():.2g} "
+        "counts a pixel (root mean square), from one part of the frame to another: "
+        f"frame.background_scale = {found.scale:g} subtracts that"
+    )
 
 
 def _lit(posterior: Posterior, params: Floats) -> Flags:
@@ -137,7 +186,14 @@ def _lit(posterior: Posterior, params: Floats) -> Flags:
     return np.asarray(~ndimage.binary_dilation(unlit, np.ones((AROUND, AROUND), bool)))
 
 
-def _surface(counts: Floats, outside: Flags, noise: Noise, scale: float) -> Floats:
+def _surface(posterior: Posterior, params: Floats, scale: float) -> Floats:
+    """The background that the pixels outside the footprints tell, everywhere, shape (ny, nx)."""
+    outside = posterior.valid & ~posterior.mask & _lit(posterior, params)
+    return _smooth(posterior.counts, outside, posterior.noise, scale)
+
+
+def _smooth(counts: Floats, outside: Flags, noise: Noise, scale: float) -> Floats:
+    """The surface through some pixels, everywhere, shape (ny, nx)."""
     rows, columns = (_splines(size, scale) for size in counts.shape)
     if rows.shape[1] * columns.shape[1] > MOST:
         raise InputError(

@@ -4,15 +4,13 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import spatial
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.context import Context
-from bayesfred.errors import InputError
 from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, MOST_ORDER
 from bayesfred.model.noise import SubtractedNoise
-from bayesfred.optimize.local_background import background_surface
+from bayesfred.optimize.local_background import structure_outside
 
 NOTICEABLE = 5.0  # standard deviations
 TILES_A_TERM = 2  # at least, for a polynomial to be tried
@@ -39,15 +37,11 @@ def background_outside(context: Context) -> Iterator[Finding]:
 
     It explains what adding it to the model would, the fluxes and the mean being fitted again.
     """
-    scale = _finest(context)
-    if scale is None:
-        return
-    try:
-        surface = background_surface(context.posterior, context.params, scale)
-    except InputError:  # too few pixels, or too many splines
+    found = structure_outside(context.posterior, context.params)
+    if found is None:
         return
     used, inverse = context.used, 1.0 / context.variance
-    structure = np.where(used, surface - context.background, 0.0)
+    structure = np.where(used, found.counts, 0.0)
     structure -= np.average(structure[used], weights=inverse[used])
     light = context.expected - context.background
     pull = context.per_source(light * structure * inverse, np.inf)
@@ -63,17 +57,8 @@ def background_outside(context: Context) -> Iterator[Finding]:
     seen = context.light.inside
     tiles = mean[seen], size[seen], place[seen].T
     mending = _mending_order(context.posterior.nuisances.background_order, tiles, 1.0)
-    cause = _uneven(context, "outside the footprints", by, mending, scale)
+    cause = _uneven(context, "outside the footprints", by, mending, found.scale)
     yield Finding(cause, float(gained), "background")
-
-
-def _finest(context: Context) -> float | None:
-    """Half the distance between neighbours: no finer structure is seen between footprints."""
-    position = context.light.position[context.light.inside]
-    if len(position) < 2 or np.array_equal(context.posterior.valid, context.posterior.mask):
-        return None
-    apart = spatial.cKDTree(position).query(position, 2)[0][:, 1]
-    return float(f"{max(0.5 * np.median(apart), 1.0):.2g}")
 
 
 def _uneven(
