@@ -26,14 +26,15 @@ from typer.testing import CliRunner
 from bayesfred.cli import app
 
 RUN: dict[str, dict[str, Any]] = {
-    "frame": {"path": "frame.npy", "gain": 1.0, "pedestal": 0.0, "saturation": 6e4},
+    "frame": {"path": "frame.npy", "gain": 1.0, "pedestal": 0.0, "saturation": 6e4,
+              "background_scale": 6.0},
     "catalogue": {"path": "stars.csv", "x": "x", "y": "y", "flux": "flux"},
     "detector": {"pixel": "impulse", "binning": 1},
     "psf": {"kind": "gaussian", "sigma": 1.5},
     "distortion": {"f_terms": [[1, 0, 1, 0]], "g_terms": [[0, 1, 0, 1]]},
     "model": {"conserve_flux": True, "tolerance": 1e-8},
     "noise": {"kind": "poisson", "read_noise": 0.0},
-    "nuisances": {"flux": "fixed", "offset": False, "background_order": 0, "footprint": 9.0},
+    "nuisances": {"flux": "fixed", "offset": False, "background_order": 0, "footprint": 5.0},
     "prior": {"f_ux": {"distribution": "norm", "loc": 0.0, "scale": 1e-2}},
     "sampling": {"seed": 1, "ensembles": 2, "walkers": 8, "steps": 2, "target_ess": 10},
     "output": {"path": "run.h5"},

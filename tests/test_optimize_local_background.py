@@ -179,8 +179,9 @@ def test_gaussian_noise_stays_what_it_is() -> None:
 def test_what_cannot_be_measured_is_refused() -> None:
     posterior = haunted(3)
     best = bf.find_map(posterior)
-    with pytest.raises(InputError, match=r"background_scale: got -1\.0, expected a width"):
-        bf.subtract_background(posterior, best, -1.0)
+    for scale in (-1.0, 0.0, 162.0, np.inf, np.nan):
+        with pytest.raises(InputError, match=rf"got {scale}, expected pixels > 0"):
+            bf.subtract_background(posterior, best, scale)
     everywhere = replace(posterior, mask=posterior.valid, nuisances=bf.Nuisances("free"))
     with pytest.raises(InputError, match="got 0 pixels outside the footprints"):
         bf.subtract_background(everywhere, best, SCALE)

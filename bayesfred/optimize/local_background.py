@@ -48,6 +48,7 @@ ROUNDS = 20  # of leaving out
 MAD = 0.6745  # median of the size of a normal number
 RESIDUAL, TURNS = 1e-6, 5000  # of conjugate gradients
 FEWEST = 30  # pixels that tell a background
+LARGEST = 50_000_000  # pixels of a frame, where nobody asked for it
 MOST = 200_000  # splines, whose equations take some GiB
 
 
@@ -73,8 +74,9 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
     Raises
     ------
     InputError
-        If the scale is not positive, or too small for the frame; if too few pixels lie outside the
-        footprints; if the noise is neither `PoissonNoise`, `FlatFieldNoise` nor `GaussianNoise`.
+        If the scale is not positive, or too small or large for the frame; if too few pixels lie
+        outside the footprints; if the noise is neither `PoissonNoise`, `FlatFieldNoise` nor
+        `GaussianNoise`.
 
     Examples
     --------
@@ -92,8 +94,11 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
     >>> estimate.fits_data, bf.find_map(even).fits_data
     (False, True)
     """
-    if not (np.isfinite(scale) and scale > 0.0):
-        raise InputError(f"background_scale: got {scale}, expected a width in pixels > 0")
+    if not 0.0 < scale <= max(posterior.mask.shape):
+        raise InputError(
+            f"background_scale: got {scale}, expected pixels > 0, and no more than the frame's "
+            f"{max(posterior.mask.shape)}"
+        )
     noise = posterior.noise
     if not isinstance(noise, PoissonNoise | FlatFieldNoise | GaussianNoise):
         raise InputError(
@@ -137,7 +142,8 @@ def structure_outside(posterior: Posterior, params: Floats) -> Structure | None:
     images = posterior.likelihood.image_positions(params) / posterior.model.detector.binning
     half = 0.5 * np.array(posterior.mask.shape[::-1])
     images = images[(np.abs(images) <= half).all(axis=1)]
-    if len(images) < 2 or np.array_equal(posterior.valid, posterior.mask):
+    large = posterior.mask.size > LARGEST
+    if large or len(images) < 2 or np.array_equal(posterior.valid, posterior.mask):
         return None
     apart = spatial.cKDTree(images).query(images, 2)[0][:, 1]
     scale = float(f"{max(0.5 * np.median(apart), 1.0):.2g}")
