@@ -76,6 +76,14 @@ def edit(data: st.DataObject, run: dict[str, dict[str, Any]]) -> None:
             run[place][name] = RUN[place][name]  # sound, but long
 
 
+def text_of(run: dict[str, dict[str, Any]]) -> str:
+    """The run file of some sections."""
+    return "".join(
+        f"[{name}]\n" + "".join(f"{toml(k)} = {toml(v)}\n" for k, v in table.items())
+        for name, table in run.items()
+    )
+
+
 def check(data: st.DataObject) -> None:
     """Give an edited run file to a command."""
     command, run = data.draw(st.sampled_from(COMMANDS)), copy.deepcopy(RUN)
@@ -85,10 +93,7 @@ def check(data: st.DataObject) -> None:
         del run["frame"]["gain"], run["frame"]["pedestal"]
     for _ in range(data.draw(st.integers(1, 2))):
         edit(data, run)
-    text = "".join(
-        f"[{name}]\n" + "".join(f"{toml(k)} = {toml(v)}\n" for k, v in table.items())
-        for name, table in run.items()
-    )
+    text = text_of(run)
     with tempfile.TemporaryDirectory() as name:
         here = Path(name)
         np.save(here / "frame.npy", sound_counts())
@@ -119,6 +124,18 @@ def check(data: st.DataObject) -> None:
 @given(data=st.data())
 def test_a_result_or_one_line(data: st.DataObject) -> None:
     check(data)
+
+
+def test_a_study_without_a_fit_has_a_picture_too(tmp_path: Path) -> None:
+    run = copy.deepcopy(RUN)
+    run["prior"]["f_ux"]["loc"] = 1e15
+    del run["frame"]["gain"], run["frame"]["pedestal"], run["simulation"]["grid"]
+    (tmp_path / "stars.csv").write_text("".join(",".join(row) + "\n" for row in STARS))
+    (tmp_path / "run.toml").write_text(text_of(run), encoding="utf-8")
+    with contextlib.chdir(tmp_path):
+        result = CliRunner().invoke(app, ["study", "run.toml", "--workers", "1"])
+    assert "2 frames, 2 failed" in result.output
+    assert (tmp_path / "study.png").stat().st_size > 10_000
 
 
 @pytest.mark.long

@@ -87,7 +87,7 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
     for k, ax in enumerate(widths):
         ax.set_visible(k < len(names))
         if k < len(names):
-            ax.set_yscale("log")
+            _logarithmic(ax)
             ax.set_title(f"sd of {labels[names[k]]}", fontsize=9.5)
             ax.tick_params(which="both", labelbottom=k + columns >= len(names), labelsize=8)
         if k < len(names) <= k + columns:
@@ -104,11 +104,17 @@ def noise_plot(study: NoiseStudy, parameters: Sequence[Parameter]) -> Figure:
         xlabel=VARIABLE_LABELS[abscissa],
         ylabel="rms over the field / px",
         title="error of the displacement",
-        yscale="log",
     )
+    _logarithmic(pixels)
     lowest = np.nanmin(cells["coverage_68"][cells["parameter"] == "theta"], initial=0.5)
     _name_shares(shares, VARIABLE_LABELS[abscissa], float(lowest) - 0.05)
     return fig
+
+
+def _logarithmic(ax: Axes) -> None:
+    """A logarithmic scale upward, where anything is above zero."""
+    if np.isfinite(ax.dataLim.minposy):
+        ax.set_yscale("log")
 
 
 def _width(ax: Axes, cells: Mapping[str, Floats], abscissa: str, colour: str) -> None:
