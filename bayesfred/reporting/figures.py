@@ -14,9 +14,10 @@ from bayesfred._typing import Floats
 from bayesfred.analysis.diagnostics import Diagnostics
 from bayesfred.analysis.field import DisplacementField
 from bayesfred.imaging.psf import MeasuredPSF
+from bayesfred.model.noise import SubtractedNoise
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.field import field_plot
-from bayesfred.reporting.frames import MAX_STARS, FittedFrame, star_panels
+from bayesfred.reporting.frames import MAX_STARS, FittedFrame, background_panels, star_panels
 from bayesfred.reporting.goodness import described_residuals, residual_panels
 from bayesfred.reporting.pairs import corner_plot, described_pairs, pairs_caption
 from bayesfred.reporting.posteriors import marginal_plot, trace_plot
@@ -108,6 +109,7 @@ def page_figures(
             _described_stars(fitted, u, v),
             png(star_panels(fitted, u, v, half_width=half_width)),
         ),
+        *_background_figures(posterior, chain.estimate.params),
         *_psf_figures(posterior),
         *_residual_figures(diagnostics, posterior),
         *_posterior_figures(chain, shown, truth),
@@ -123,6 +125,27 @@ def page_figures(
             )
         )
     return figures
+
+
+def _background_figures(posterior: Posterior, params: Floats) -> list[PageFigure]:
+    """The background, if its structure was measured and subtracted."""
+    noise = posterior.noise
+    if not isinstance(noise, SubtractedNoise):
+        return []
+    background = posterior.likelihood.background(params) + noise.light
+    light = noise.light[posterior.mask]
+    return [
+        PageFigure(
+            "Background",
+            "The frame before its background's structure was subtracted, and that structure with "
+            "the background that was fitted to the rest, on one scale. Errors of the structure are "
+            "not in those of the parameters.",
+            f"The background reaches from {background[posterior.mask].min():.4g} to "
+            f"{background[posterior.mask].max():.4g} counts per pixel among the sources. What was "
+            f"subtracted of it varies by {light.std():.3g} counts per pixel (root mean square).",
+            png(background_panels(posterior.counts + noise.light, background, posterior.mask)),
+        )
+    ]
 
 
 def _psf_figures(posterior: Posterior) -> list[PageFigure]:

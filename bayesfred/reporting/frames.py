@@ -22,6 +22,7 @@ from bayesfred.reporting.panels import DPI, SMALL, Box, Panel, Sheet
 
 __all__ = [
     "FittedFrame",
+    "background_panels",
     "colour_bar",
     "draw_triptych",
     "frame_panel",
@@ -104,6 +105,36 @@ def residual_panels(frames: Sequence[FittedFrame]) -> Figure:
         panel.label_beside("v / pixel", 0.62, fontsize=13)
     box = (sheet.width - 0.95, BELOW, 0.2, sheet.height - 1.1)
     colour_bar(sheet, box, RESIDUALS, "residual / sigma")
+    return sheet.finish()
+
+
+def background_panels(frame: Floats, background: Floats, used: Flags) -> Figure:
+    """A frame and the background that was measured in it, on one scale.
+
+    Parameters
+    ----------
+    frame, background : ndarray, shape (ny, nx), counts per pixel
+    used : ndarray of bool, shape (ny, nx)
+        Pixels whose background the scale holds.
+
+    Returns
+    -------
+    Figure
+    """
+    least, most = np.percentile(background[used], (0.0, 99.9))
+    ny, nx = frame.shape
+    high = SIDE * min(max(float(ny / nx), 0.25), 2.0)
+    sheet = Sheet(2.0 * (LEFT + SIDE) + 1.2, BELOW + high + ABOVE)
+    margin = 0.1 * float(most - least)
+    span = float(least) - margin, float(most) + margin
+    for k, (values, title) in enumerate(((frame, "frame"), (background, "background"))):
+        place = LEFT + (LEFT + SIDE) * k, BELOW, high
+        panel = _show(sheet, place, values, Normalize(*span, clip=True), COUNTS_MAP)
+        panel.label_above(title, fontsize=15)
+        if not k:
+            panel.label_beside("v / pixel", 0.62, fontsize=13)
+    box = (panel.box[0] + panel.box[2] + 0.1, panel.box[1], 0.175, panel.box[3])
+    colour_bar(sheet, box, (COUNTS_MAP, span), "counts per pixel")
     return sheet.finish()
 
 
