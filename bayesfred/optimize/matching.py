@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import linalg, spatial
+from scipy import spatial
 
 from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.imaging.forward import ForwardModel
@@ -122,7 +122,9 @@ class Field:
         weight = np.ones(right.size)
         scale = error
         for _ in range(6):
-            inverse = linalg.inv((matrix.T * weight) @ matrix / scale**2 + np.eye(self.scale.size))
+            inverse = np.linalg.inv(
+                (matrix.T * weight) @ matrix / scale**2 + np.eye(self.scale.size)
+            )
             z = inverse @ (matrix.T @ (weight * right)) / scale**2
             # studentised: a fit follows a star that alone determines it, right or wrong
             own = np.sum((matrix @ inverse) * matrix, axis=1)
