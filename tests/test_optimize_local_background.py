@@ -176,6 +176,22 @@ def test_gaussian_noise_stays_what_it_is() -> None:
     assert (posterior.counts - even.counts)[even.mask].min() == 0.0
 
 
+def test_frames_whose_sky_was_taken_off_have_no_dark_parts() -> None:
+    """The mean of their background is about zero, on both sides of it."""
+    rng, true = np.random.default_rng(921), haunted(6)
+    sky = planted.LEVEL + np.zeros(planted.SHAPE)
+    noise = bf.GaussianNoise(np.full(planted.SHAPE, 60.0))
+    off = true.counts - sky - 20.0 + rng.normal(0.0, 5.0, planted.SHAPE)  # the ghost has 60
+    posterior = bf.follow_images(replace(true, counts=off, noise=noise))
+    even = bf.subtract_background(posterior, bf.find_map(posterior), SCALE)
+    light = posterior.counts - even.counts
+    v, u = np.indices(planted.SHAPE) - planted.HALF
+    inside = np.hypot(u + 15.0, v - 20.0) < 30.0
+    outside = np.hypot(u + 15.0, v - 20.0) > 65.0
+    assert light[inside].mean() == pytest.approx(40.0, abs=2.0)
+    assert light[outside & even.mask].mean() == pytest.approx(-20.0, abs=2.0)
+
+
 def test_what_cannot_be_measured_is_refused() -> None:
     posterior = haunted(3)
     best = bf.find_map(posterior)

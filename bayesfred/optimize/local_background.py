@@ -41,6 +41,7 @@ BAND = 2 * DEGREE + 1  # splines that overlap one, along an axis
 NOTICEABLE = 5.0  # standard deviations of the sum of squares
 UNLIT = 0.2  # of the lowest background in use
 AROUND = 7  # pixels a side of a square
+SURE = 5.0  # standard deviations of a square's mean
 STIFF = 0.5  # of the scale, over which the surface does not bend
 CLIP = 3.0  # standard deviations off the surface
 FEW = 1e-3  # of the pixels, which may still change
@@ -107,8 +108,9 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
         )
     level = _surface(posterior, estimate.params, scale)
     lowest = max(float(level[posterior.mask].min()), 0.0)
-    light = np.maximum(level - lowest, 0.0)
+    light = level - lowest
     if not isinstance(noise, GaussianNoise):
+        light = np.maximum(light, 0.0)  # expected of photons
         noise = SubtractedNoise(noise, light)
     return replace(posterior, counts=posterior.counts - light, noise=noise, extrapolation=None)
 
@@ -185,10 +187,13 @@ def background_message(posterior: Posterior, params: Floats) -> str:
 
 def _lit(posterior: Posterior, params: Floats) -> Flags:
     """The pixels in no square without light, by the background of those in use, (ny, nx)."""
-    least = UNLIT * posterior.likelihood.background(params)[posterior.mask].min()
+    least = float(posterior.likelihood.background(params)[posterior.mask].min())
+    variance = posterior.noise.counts_variance(np.full(posterior.mask.shape, max(least, 0.0)), 0.0)
+    if not (1.0 - UNLIT) * least > SURE * np.median(variance) ** 0.5 / AROUND:
+        return np.ones(posterior.mask.shape, bool)  # so little light that none is like it
     seen = posterior.valid.astype(float)
     light = ndimage.uniform_filter(np.where(posterior.valid, posterior.counts, 0.0), AROUND)
-    unlit = light < least * ndimage.uniform_filter(seen, AROUND)
+    unlit = light < UNLIT * least * ndimage.uniform_filter(seen, AROUND)
     return np.asarray(~ndimage.binary_dilation(unlit, np.ones((AROUND, AROUND), bool)))
 
 
