@@ -49,6 +49,23 @@ def test_log_prob_is_that_of_the_counts_before(case: str) -> None:
     assert posterior.log_prob(params) == -math.inf
 
 
+@pytest.mark.slow
+def test_model_error_is_beside_the_variance_of_the_counts_before() -> None:
+    posterior, params = frame("photons", Nuisances("scale", model_error=True))
+    named = dict(zip(posterior.parameter_names, params, strict=True))
+    light, level = dense_image(posterior.model, named), named["background"]
+    wrong = (named["model_error"] * light) ** 2
+    before, mean = bf.PoissonNoise(), light + level + LIGHT
+    counts = posterior.counts + LIGHT
+    top = before.log_likelihood(counts, np.maximum(counts, 1e-12), 0.0)
+    lost = top - before.log_likelihood(counts, mean, 0.0)
+    share = mean / (mean + wrong)  # the double Poisson distribution, whose variance that is
+    expected = (top + 0.5 * np.log(share) - lost * share)[posterior.mask].sum()
+    value = posterior.log_prob(params) - posterior.log_prior(params)[0]
+    assert named["model_error"] > 0.0
+    assert value == pytest.approx(float(expected), rel=1e-10)
+
+
 @pytest.mark.parametrize(
     ("case", "nuisances"),
     [
