@@ -225,6 +225,7 @@ def test_run_file(tmp_path: Path, kind: str) -> None:
     assert light.min() == 0.0 and 35.0 < light.max() < 60.0
     page = (tmp_path / "chains" / "run.html").read_text()
     assert re.search(r"The background reaches from (5\d|6\d)(\.\d+)? to \d+", page)
+    assert "Poisson noise, structure of the background subtracted" in page
     # without it the line that proposes it
     run.write_text(text.replace("background_scale = 6.0\n", ""))
     output = invoke(tmp_path, "fit", "run.toml", "--map-only", "--overwrite")

@@ -26,6 +26,7 @@ from bayesfred.io import atomic
 from bayesfred.io.marks import marked
 from bayesfred.io.summary_table import Table
 from bayesfred.model.joint import JointPosterior
+from bayesfred.model.noise import SubtractedNoise
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.figures import PageFigure
@@ -243,14 +244,17 @@ def described_model(record: RunRecord, posterior: Posterior) -> str:
     model, free = posterior.model, posterior.nuisances
     ny, nx = posterior.counts.shape
     box = " integrated over the pixel" if model.detector.pixel == "box" else ""
-    number = len(model.sources)
+    number, noise = len(model.sources), posterior.noise
     parts = [
         f"{record.frame or 'frame'}, {ny} × {nx} pixels",
         f"{number} source{'s' * (number != 1)} of {free.flux} flux",
         f"{_words(model.psf)}{box}",
         f"distortion of {model.distortion.n_terms} terms",
-        _words(posterior.noise),
     ]
+    if isinstance(noise, SubtractedNoise):
+        parts += [_words(noise.noise), "structure of the background subtracted"]
+    else:
+        parts.append(_words(noise))
     names = [name.replace("_", " ") for name in free.names]
     return ", ".join(parts) + (f"; also free: {', '.join(names)}" if names else "")
 
