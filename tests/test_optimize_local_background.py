@@ -13,6 +13,8 @@ from test_cli import invoke
 from test_pipeline_frames import write
 
 import bayesfred as bf
+from bayesfred.analysis.causes.background import background_outside
+from bayesfred.analysis.causes.context import Context
 from bayesfred.errors import InputError
 from bayesfred.optimize import local_background
 from bayesfred.optimize.fit_statistics import fit_statistics, misfit
@@ -148,6 +150,19 @@ def test_the_verdict_names_the_remedy_which_cures() -> None:
     wide = bf.subtract_background(posterior, rough, 60.0)
     causes = bf.find_causes(wide, bf.find_map(wide).params)
     assert causes[0].name == "background" and "narrow frame.background_scale" in causes[0].remedy
+
+
+@pytest.mark.slow
+def test_light_outside_the_footprints_alone_is_no_cause() -> None:
+    """It has to explain what is left within them, as that of a whole ghost does."""
+    for everywhere in (False, True):
+        posterior = bf.follow_images(haunted(7, 0.0))
+        ghost = haunted(7).counts - posterior.counts
+        light = ghost if everywhere else np.where(posterior.mask, 0.0, ghost)
+        posterior = replace(posterior, counts=posterior.counts + light)
+        params = bf.find_map(posterior).params
+        context = Context(posterior, params, np.zeros(planted.SHAPE, bool), rejected=False)
+        assert len(list(background_outside(context))) == everywhere
 
 
 @pytest.mark.slow

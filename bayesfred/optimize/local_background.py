@@ -50,7 +50,7 @@ MAD = 0.6745  # median of the size of a normal number
 RESIDUAL, TURNS = 1e-6, 5000  # of conjugate gradients
 FEWEST = 30  # pixels that tell a background
 LARGEST = 50_000_000  # pixels of a frame, where nobody asked for it
-MOST = 200_000  # splines, whose equations take some GiB
+MOST = 200_000  # splines, whose equations take over half a GiB
 
 
 def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: float) -> Posterior:
