@@ -207,17 +207,19 @@ def test_frames_whose_sky_was_taken_off_have_no_dark_parts() -> None:
     assert light[outside & even.mask].mean() == pytest.approx(-20.0, abs=2.0)
 
 
-def test_what_cannot_be_measured_is_refused() -> None:
+def test_what_cannot_be_measured_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     posterior = haunted(3)
     best = bf.find_map(posterior)
-    for scale in (-1.0, 0.0, 162.0, np.inf, np.nan):
-        with pytest.raises(InputError, match=rf"got {scale}, expected pixels > 0"):
+    for scale in (-1.0, 0.0, 1e-300, 0.99, 162.0, np.inf, np.nan):
+        with pytest.raises(InputError, match=rf"got {scale:g}, expected pixels, at least 1 and no"):
             bf.subtract_background(posterior, best, scale)
     everywhere = replace(posterior, mask=posterior.valid, nuisances=bf.Nuisances("free"))
     with pytest.raises(InputError, match="got 0 pixels outside the footprints"):
         bf.subtract_background(everywhere, best, SCALE)
-    with pytest.raises(InputError, match="splines would be needed, expected a wider one"):
-        bf.subtract_background(posterior, best, 0.2)
+    with monkeypatch.context() as patch:
+        patch.setattr(local_background, "MOST", 26_000)
+        with pytest.raises(InputError, match="163 x 163 splines would be needed, expected a wider"):
+            bf.subtract_background(posterior, best, 1.0)
     paper = bf.Posterior(posterior.model, posterior.counts, noise=bf.BackgroundNoise())
     with pytest.raises(InputError, match="got BackgroundNoise, whose variance would change"):
         bf.subtract_background(paper, best, SCALE)

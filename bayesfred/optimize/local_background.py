@@ -75,7 +75,7 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
     Raises
     ------
     InputError
-        If the scale is not positive, or too small or large for the frame; if too few pixels lie
+        If the scale is below a pixel, or too small or large for the frame; if too few pixels lie
         outside the footprints; if the noise is neither `PoissonNoise`, `FlatFieldNoise` nor
         `GaussianNoise`.
 
@@ -95,10 +95,10 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
     >>> estimate.fits_data, bf.find_map(even).fits_data
     (False, True)
     """
-    if not 0.0 < scale <= max(posterior.mask.shape):
+    if not 1.0 <= scale <= max(posterior.mask.shape):
         raise InputError(
-            f"background_scale: got {scale}, expected pixels > 0, and no more than the frame's "
-            f"{max(posterior.mask.shape)}"
+            f"background_scale: got {scale:g}, expected pixels, at least 1 and no more than the "
+            f"frame's {max(posterior.mask.shape)}"
         )
     noise = posterior.noise
     if not isinstance(noise, PoissonNoise | FlatFieldNoise | GaussianNoise):
