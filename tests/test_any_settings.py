@@ -62,7 +62,7 @@ def edit(data: st.DataObject, run: dict[str, dict[str, Any]]) -> None:
     """Change a value, or one inside it."""
     section = data.draw(st.sampled_from([*run]))
     table, key = run[section], data.draw(st.sampled_from([*run[section]]))
-    while isinstance(table[key], dict) and data.draw(st.booleans()):
+    while isinstance(table[key], dict) and table[key] and data.draw(st.booleans()):
         table = table[key]
         key = data.draw(st.sampled_from([*table]))
     if isinstance(table[key], list) and data.draw(st.booleans()):
