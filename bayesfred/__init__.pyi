@@ -28,6 +28,7 @@ from .model.drift import Drift
 from .model.joint import JointPosterior
 from .model.noise import (
     BackgroundNoise,
+    CorrelatedNoise,
     FlatFieldNoise,
     GaussianNoise,
     PoissonNoise,
@@ -59,6 +60,7 @@ __all__ = [
     "Chain",
     "Comparison",
     "CorrectedFrame",
+    "CorrelatedNoise",
     "CrossCheck",
     "Design",
     "Detector",

@@ -20,7 +20,7 @@ from bayesfred.io.frames import read_frame, require_memory
 from bayesfred.io.paths import resolve
 from bayesfred.io.pixel_maps import PixelMaps, read_maps
 from bayesfred.model import priors
-from bayesfred.model.noise import FlatFieldNoise, Noise, PoissonNoise, simulate
+from bayesfred.model.noise import CorrelatedNoise, FlatFieldNoise, Noise, PoissonNoise, simulate
 from bayesfred.model.posterior import Posterior
 from bayesfred.settings.joint import JointRun
 from bayesfred.settings.simulation import SimulationSettings
@@ -140,6 +140,8 @@ def noise_given(
             )
     if maps.flat is not None:
         noise = FlatFieldNoise(cast(PoissonNoise, noise), maps.flat)
+    if run.frame.noise_correlation_ratio != 1.0:
+        noise = CorrelatedNoise(noise, run.frame.noise_correlation_ratio)
     return noise, line
 
 

@@ -53,7 +53,7 @@ def test_errors_are_those_of_positions_in_such_noise(share: float) -> None:
     assert found is not None
     beside = share * (1.0 - share) / (1.0 - 2.0 * share * (1.0 - share))
     assert found.along == pytest.approx([beside, beside], abs=0.005)
-    assert found.factor == pytest.approx(scatter_of_positions(z), rel=0.01)
+    assert found.ratio == pytest.approx(scatter_of_positions(z), rel=0.01)
     # the control: as if diagonal neighbours shared none
     square = 0.25 / WIDTH**2
     without = (1.0 + 4.0 * beside * np.exp(-square) * (1.0 - square)) ** 0.5
@@ -74,7 +74,7 @@ def test_a_sharpened_frame_has_errors_that_are_smaller() -> None:
     z = z - 0.6 * ndimage.uniform_filter(z, 3, mode="wrap")
     found = shared_noise(z / z.std(), everywhere(z), WIDTH)
     assert found is not None
-    assert found.factor < 0.8
+    assert found.ratio < 0.8
     assert max(found.along) < 0.0
 
 

@@ -347,6 +347,8 @@ def test_the_error_of_bright_sources_goes_with_the_root_and_of_faint_ones_with_t
     faint = posterior_of(background=1e3, flux=2e3)
     factor = photons_needed(faint, params, error_now(faint, params) / 3.0).factor
     assert 3.0 < factor < 3.5
+    invisible = posterior_of(background=2.0, flux=1e-300)
+    assert photons_needed(invisible, np.array([0.02, -0.01, 2.0]), 0.01).factor == math.inf
 
 
 def test_sources_about_the_middle_alone_tell_of_the_whole_field() -> None:

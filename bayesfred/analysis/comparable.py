@@ -8,6 +8,7 @@ from bayesfred.analysis.joint_folds import AnyPosterior, FrameView, frame_views
 from bayesfred.analysis.verdict import judge_approximation, judge_sampling
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
+from bayesfred.model.noise import correlation_ratio
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.displacement import frame_posterior
@@ -102,6 +103,12 @@ def _require_same(first: str, one: FrameView, name: str, other: FrameView) -> No
                 f"{name}: {frame}{what}: got others than those of {first}, expected models of the "
                 "same frame and pixels"
             )
+    known, ratio = (correlation_ratio(view.posterior.noise) for view in (one, other))
+    if known != ratio:
+        raise InputError(
+            f"{name}: {frame}noise: got a correlation ratio of {ratio:g}, and {known:g} for "
+            f"{first}, expected one: likelihoods of the same noise are compared"
+        )
     if one.posterior.noise.discrete != other.posterior.noise.discrete:
         discrete, density = (first, name) if one.posterior.noise.discrete else (name, first)
         raise InputError(

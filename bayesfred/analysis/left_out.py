@@ -52,7 +52,7 @@ class Weights(NamedTuple):
     def of(cls, posterior: Posterior, params: Floats) -> "Weights":
         """The variance of the noise, and with the model error, as a posterior expects them."""
         level = params[posterior.parameter_names.index("background")]
-        noise = posterior.noise.counts_variance(posterior.expected_counts(params), level)
+        noise = posterior.noise.pixelwise.counts_variance(posterior.expected_counts(params), level)
         return cls(noise, posterior.sigma(params) ** 2)
 
 

@@ -312,7 +312,7 @@ def noise_study(
     >>> study.cells["background"][rows].tolist(), bool(np.diff(study.cells["bound"][rows]) > 0)
     ([0.5, 50.0], True)
     """
-    check("noise study", replicates, method)
+    check("noise study", replicates, method, noise)
     for name in SCALES:
         if getattr(nuisances, name):
             raise InputError(

@@ -106,7 +106,7 @@ def photons_needed(posterior: Posterior, params: npt.ArrayLike, error: float) ->
         return math.log(laplace_error(brighter, params, points) / error)
 
     low = -math.log(WIDEST)
-    high = min(-low, math.log(MOST_PHOTONS / fluxes.max()))
+    high = min(-low, math.log(MOST_PHOTONS) - math.log(fluxes.max()))
     guess = min(max(2.0 * excess(0.0), low), high)  # the root's law
     step = math.log(2.0)
     below, above = max(guess - step, low), min(guess + step, high)

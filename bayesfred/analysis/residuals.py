@@ -34,7 +34,7 @@ from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
 from bayesfred.analysis.source_tests import SourceTests, source_tests
 from bayesfred.analysis.sources import SourceFits, fit_sources, tabulate
 from bayesfred.io.summary_table import Table
-from bayesfred.model.noise import Noise
+from bayesfred.model.noise import Noise, correlation_ratio
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.matched import image_width
 
@@ -111,7 +111,7 @@ def judge_residuals(
         phases,
         scores,
         tests,
-        shared_noise(z, quiet, image_width(posterior, params)),
+        shared_noise(z, quiet, image_width(posterior, params), correlation_ratio(posterior.noise)),
         (
             *scores.checks,
             *tests.checks,

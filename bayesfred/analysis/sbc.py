@@ -275,8 +275,8 @@ def simulation_based_calibration(
     >>> study.calibrated, study.n, study.quantities["quantity"][:3].tolist()
     (True, 20, ['f_ux', 'background', 'log_likelihood'])
     """
-    check("calibration", replicates, method)
     judged = fitted or posterior
+    check("calibration", replicates, method, judged.noise)
     if judged.parameter_names != posterior.parameter_names:
         raise InputError(
             f"calibration: fitted: got the parameters {', '.join(judged.parameter_names)}, "

@@ -29,7 +29,7 @@ FAR = ((0, 5), (5, 0), (5, 5), (5, -5))  # rows and columns, at which there shou
 OUTLYING = 3.0  # standard deviations, as which a pixel counts at most
 NOTICEABLE = 5.0  # standard deviations of a correlation
 SHORT = 0.25  # of the largest covariance: more than this far away is another fault
-WIDER = 1.1  # factor of the errors from which it matters
+WIDER = 1.1  # times wider errors, from which it matters
 
 
 class SharedNoise(NamedTuple):
@@ -39,15 +39,18 @@ class SharedNoise(NamedTuple):
     ----------
     along : tuple of two floats
         Correlation of pixels side by side along u, and along v.
-    factor : float
+    ratio : float
         Errors of positions over those with independent pixels of the same scatter.
+    known : float
+        What the errors take that for.
     """
 
     along: tuple[float, float]
-    factor: float
+    ratio: float
+    known: float = 1.0
 
 
-def shared_noise(z: Floats, quiet: Flags, width: float) -> SharedNoise | None:
+def shared_noise(z: Floats, quiet: Flags, width: float, known: float = 1.0) -> SharedNoise | None:
     """Look for correlations of noise that falsify errors by a tenth or more.
 
     Parameters
@@ -58,11 +61,13 @@ def shared_noise(z: Floats, quiet: Flags, width: float) -> SharedNoise | None:
         The pixels between the sources.
     width : float
         Standard deviation of an image, pixel.
+    known : float
+        What the errors take the ratio for.
 
     Returns
     -------
     SharedNoise or None
-        None where none is found.
+        None where the ratio is what it is taken for, as far as the pixels tell.
     """
     z = np.where(quiet, np.clip(z, -OUTLYING, OUTLYING), 0.0)
     every = product(range(REACH + 1), range(-REACH, REACH + 1))
@@ -74,17 +79,20 @@ def shared_noise(z: Floats, quiet: Flags, width: float) -> SharedNoise | None:
     common = float(far[:, 0].mean())
     variance = float(np.sum(z**2) / quiet.sum()) - common
     rho = (near[:, 0] - common) / max(variance, 1e-300)
-    largest = np.abs(rho).max()
-    if not (np.abs(rho) * np.sqrt(near[:, 1])).max() > NOTICEABLE:
+    square = np.sum(np.square(half), axis=1) / (4.0 * width**2)
+    weight = 2.0 * np.exp(-square) * (1.0 - square)
+    scatter = max(1.0 + float(rho @ weight), 0.0)  # of positions
+    noticed = (np.abs(rho) * np.sqrt(near[:, 1])).max() > NOTICEABLE
+    if known != 1.0:
+        sd = float(np.sqrt(np.sum(weight**2 / near[:, 1])))
+        noticed = abs(scatter - known**2) > NOTICEABLE * sd
+    if not noticed or 1.0 / WIDER < scatter**0.5 / known < WIDER:
         return None
     noise = NOTICEABLE * variance / np.sqrt(far[:, 1])
-    if (np.abs(far[:, 0]) > SHORT * largest * variance + noise).any():
+    if (np.abs(far[:, 0]) > SHORT * np.abs(rho).max() * variance + noise).any():
         return None
-    square = np.sum(np.square(half), axis=1) / (4.0 * width**2)
-    factor = float(max(1.0 + 2.0 * rho @ (np.exp(-square) * (1.0 - square)), 0.0) ** 0.5)
-    if 1.0 / WIDER < factor < WIDER:
-        return None
-    return SharedNoise((float(rho[half.index((0, 1))]), float(rho[half.index((1, 0))])), factor)
+    along = float(rho[half.index((0, 1))]), float(rho[half.index((1, 0))])
+    return SharedNoise(along, scatter**0.5, known)
 
 
 def _covariance(z: Floats, quiet: Flags, lag: tuple[int, int]) -> tuple[float, int]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
+from bayesfred.model.noise import Noise
 from bayesfred.model.posterior import Posterior
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.find_map import find_map
@@ -21,8 +22,13 @@ ENSEMBLES = 2
 WALKERS = 16  # of each, at least
 
 
-def check(what: str, replicates: int, method: str) -> None:
+def check(what: str, replicates: int, method: str, noise: Noise) -> None:
     """Refuse settings that no study can have."""
+    if noise.pixelwise is not noise:
+        raise InputError(
+            f"{what}: noise: got {type(noise).__name__}, expected that of independent pixels, such "
+            "as simulated frames have"
+        )
     if replicates < 2:
         raise InputError(f"{what}: replicates: got {replicates}, expected at least 2")
     if method not in get_args(Method):

@@ -312,7 +312,7 @@ def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
     left_out += ["its fluxes"] if nuisances.flux == "fixed" else []
     if not nuisances.model_error:
         left_out.append("the PSF's shape" if nuisances.psf_sigma else "the PSF")
-    if isinstance(posterior.noise, SubtractedNoise):
+    if isinstance(posterior.noise.pixelwise, SubtractedNoise):
         left_out.append("the background that was subtracted")
     left_out += ["the choice of terms"]
     sentence = f"The error bars leave out errors of {_listed(left_out)}"

@@ -114,7 +114,7 @@ def simulate_frame(run_file: PathLike, *, overwrite: bool = False) -> Simulated:
         s = posterior.model.sources
         record = CatalogueRecord(s.x, s.y, s.flux)
         write_catalogue(catalogue, record, overwrite=overwrite)
-    recorded = posterior.counts * getattr(posterior.noise, "response", 1.0)
+    recorded = posterior.counts * getattr(posterior.noise.pixelwise, "response", 1.0)
     write_frame(frame, recorded, overwrite=overwrite)
     return Simulated(posterior, truth, frame, catalogue if grid else None)
 

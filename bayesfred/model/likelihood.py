@@ -36,7 +36,7 @@ from bayesfred.model.kernels.gradient import gradient
 from bayesfred.model.kernels.likelihood import clear, new_workspace
 from bayesfred.model.kernels.sources import OwnPixels, own_pixels
 from bayesfred.model.near_mean import Around, problem_near
-from bayesfred.model.noise import ModelErrorNoise, Noise
+from bayesfred.model.noise import Noise, with_model_error
 from bayesfred.model.parameters import (
     BACKGROUND_TERMS,
     SCALES,
@@ -288,7 +288,7 @@ class FrameLikelihood:
             return self.noise
         _, nuisances, level = self._one(params)
         slope = polynomial_background(self.mask.shape, level) - level[0]
-        return ModelErrorNoise(self.noise, nuisances.model_error, slope)
+        return with_model_error(self.noise, nuisances.model_error, slope)
 
     def image_positions(self, params: Floats) -> Floats:
         """Where the sources are imaged, shape (s, 2), fine pixel; nan without an image."""

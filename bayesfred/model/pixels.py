@@ -13,7 +13,7 @@ from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.kernels.contexts import SEGMENT, stride
 from bayesfred.io.memory import require_room
 from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, LIMIT, MASKED, Frame
-from bayesfred.model.noise import Noise, model_error_terms
+from bayesfred.model.noise import Noise, correlated_terms, model_error_terms
 from bayesfred.model.parameters import Nuisances
 
 OVERLAP = 12.0  # PSF widths beyond which sources have nothing to do with one another
@@ -134,15 +134,16 @@ def padded_frame(counts: Floats, mask: Flags, noise: Noise, nuisances: Nuisances
     np.copyto(values[:, :nx], counts, where=mask)
     used = (values > LIMIT).reshape(-1, SEGMENT)
     total = values.reshape(-1, SEGMENT).sum(axis=1, where=used)
-    varies, terms = nuisances.background_order > 0, noise.terms(values)
+    varies, alone = nuisances.background_order > 0, noise.pixelwise
+    terms = alone.terms(values)
     everywhere = varies or not hasattr(terms, "unreached")
     if not everywhere:
-        terms = noise.with_unreached(terms, values)
+        terms = alone.with_unreached(terms, values)
     if nuisances.model_error:
-        terms = model_error_terms(noise, terms, stride(nx), counts, mask)
+        terms = model_error_terms(alone, terms, stride(nx), counts, mask)
     return Frame(
         values.ravel(), used.sum(axis=1).astype(float), total, float(used.sum()),
-        float(total.sum()), ny, nx, terms, varies, everywhere,
+        float(total.sum()), ny, nx, correlated_terms(noise, terms), varies, everywhere,
     )  # fmt: skip
 
 

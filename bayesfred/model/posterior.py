@@ -291,7 +291,8 @@ class Posterior(FrameDensity):
     def sigma(self, params: npt.ArrayLike) -> Floats:
         """Standard deviation of every pixel's counts under the noise model, shape (ny, nx)."""
         level = self._vector(params)[self.parameter_names.index("background")]
-        return np.sqrt(self.noise_at(params).counts_variance(self.expected_counts(params), level))
+        noise = self.noise_at(params).pixelwise
+        return np.sqrt(noise.counts_variance(self.expected_counts(params), level))
 
     def noise_at(self, params: npt.ArrayLike) -> Noise:
         """The noise of the counts, the model error included, given the parameters."""

@@ -25,7 +25,9 @@ def require_light(posterior: Posterior) -> None:
     """
     counts, used, number = posterior.counts, posterior.mask, int(posterior.mask.sum())
     low, high = float(counts[used].min()), float(counts[used].max())
-    if (low == high and number > 1) or (isinstance(posterior.noise, PoissonNoise) and high < 1):
+    if (low == high and number > 1) or (
+        isinstance(posterior.noise.pixelwise, PoissonNoise) and high < 1
+    ):
         got = f"{high:g} in each" if low == high else f"at most {high:.2g}"
         raise InputError(
             f"counts: got {got} of {number} pixels, expected images of the sources: such a "

@@ -52,7 +52,8 @@ def fit_statistics(posterior: Posterior, params: Floats) -> dict[str, Any]:
     """The numbers that judge a fit, by the names that `Diagnostics` gives them."""
     level = float(params[posterior.parameter_names.index("background")])
     background = level if posterior.nuisances.background_order == 0 else math.nan
-    noise, sums, moments = posterior.noise_at(params), np.zeros(7), np.zeros(3)
+    noise = posterior.noise_at(params).pixelwise
+    sums, moments = np.zeros(7), np.zeros(3)
     # a mean of zero makes a statistic infinite, which is its value
     with posterior.likelihood.expected(params) as expected, np.errstate(all="ignore"):
         for n, mu, own in _parts(posterior, expected, noise):

@@ -27,6 +27,7 @@ from scipy.sparse.linalg import cg
 from bayesfred._typing import Flags, Floats
 from bayesfred.errors import InputError
 from bayesfred.model.noise import (
+    CorrelatedNoise,
     FlatFieldNoise,
     GaussianNoise,
     Noise,
@@ -100,7 +101,7 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
             f"background_scale: got {scale:g}, expected pixels, at least 1 and no more than the "
             f"frame's {max(posterior.mask.shape)}"
         )
-    noise = posterior.noise
+    noise = posterior.noise.pixelwise
     if not isinstance(noise, PoissonNoise | FlatFieldNoise | GaussianNoise):
         raise InputError(
             f"background_scale: got {type(noise).__name__}, whose variance would change with what "
@@ -112,6 +113,8 @@ def subtract_background(posterior: Posterior, estimate: MapEstimate, scale: floa
     if not isinstance(noise, GaussianNoise):
         light = np.maximum(light, 0.0)  # expected of photons
         noise = SubtractedNoise(noise, light)
+    if isinstance(posterior.noise, CorrelatedNoise):
+        noise = replace(posterior.noise, noise=noise)
     return replace(posterior, counts=posterior.counts - light, noise=noise, extrapolation=None)
 
 
@@ -188,7 +191,8 @@ def background_message(posterior: Posterior, params: Floats) -> str:
 def _lit(posterior: Posterior, params: Floats) -> Flags:
     """The pixels in no square without light, by the background of those in use, (ny, nx)."""
     least = float(posterior.likelihood.background(params)[posterior.mask].min())
-    variance = posterior.noise.counts_variance(np.full(posterior.mask.shape, max(least, 0.0)), 0.0)
+    noise = posterior.noise.pixelwise
+    variance = noise.counts_variance(np.full(posterior.mask.shape, max(least, 0.0)), 0.0)
     if not (1.0 - UNLIT) * least > SURE * np.median(variance) ** 0.5 / AROUND:
         return np.ones(posterior.mask.shape, bool)  # so little light that none is like it
     seen = posterior.valid.astype(float)
@@ -200,7 +204,7 @@ def _lit(posterior: Posterior, params: Floats) -> Flags:
 def _surface(posterior: Posterior, params: Floats, scale: float) -> Floats:
     """The background that the pixels outside the footprints tell, everywhere, shape (ny, nx)."""
     outside = posterior.valid & ~posterior.mask & _lit(posterior, params)
-    return _smooth(posterior.counts, outside, posterior.noise, scale)
+    return _smooth(posterior.counts, outside, posterior.noise.pixelwise, scale)
 
 
 def _smooth(counts: Floats, outside: Flags, noise: Noise, scale: float) -> Floats:

@@ -129,7 +129,7 @@ def page_figures(
 
 def _background_figures(posterior: Posterior, params: Floats) -> list[PageFigure]:
     """The background, if its structure was measured and subtracted."""
-    noise = posterior.noise
+    noise = posterior.noise.pixelwise
     if not isinstance(noise, SubtractedNoise):
         return []
     background = posterior.likelihood.background(params) + noise.light

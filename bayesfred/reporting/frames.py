@@ -66,7 +66,7 @@ class FittedFrame:
         """The frame of a posterior with the model of one parameter vector, shape (d,)."""
         expected = posterior.expected_counts(params)
         level = params[posterior.parameter_names.index("background")]
-        variance = posterior.noise_at(params).counts_variance(expected, level)
+        variance = posterior.noise_at(params).pixelwise.counts_variance(expected, level)
         return cls(posterior.counts, expected, np.sqrt(variance), posterior.mask)
 
     def recorded(self) -> Floats:

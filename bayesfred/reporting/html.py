@@ -26,7 +26,7 @@ from bayesfred.io import atomic
 from bayesfred.io.marks import marked
 from bayesfred.io.summary_table import Table
 from bayesfred.model.joint import JointPosterior
-from bayesfred.model.noise import SubtractedNoise
+from bayesfred.model.noise import SubtractedNoise, correlation_ratio
 from bayesfred.model.parameters import Parameter
 from bayesfred.model.posterior import Posterior
 from bayesfred.reporting.figures import PageFigure
@@ -244,7 +244,7 @@ def described_model(record: RunRecord, posterior: Posterior) -> str:
     model, free = posterior.model, posterior.nuisances
     ny, nx = posterior.counts.shape
     box = " integrated over the pixel" if model.detector.pixel == "box" else ""
-    number, noise = len(model.sources), posterior.noise
+    number, noise = len(model.sources), posterior.noise.pixelwise
     parts = [
         f"{record.frame or 'frame'}, {ny} × {nx} pixels",
         f"{number} source{'s' * (number != 1)} of {free.flux} flux",
@@ -255,6 +255,8 @@ def described_model(record: RunRecord, posterior: Posterior) -> str:
         parts += [_words(noise.noise), "structure of the background subtracted"]
     else:
         parts.append(_words(noise))
+    if noise is not posterior.noise:
+        parts.append(f"noise correlation ratio {correlation_ratio(posterior.noise):g}")
     names = [name.replace("_", " ") for name in free.names]
     return ", ".join(parts) + (f"; also free: {', '.join(names)}" if names else "")
 

@@ -43,6 +43,9 @@ class FrameSettings(Section):
     background_scale : float, optional, recorded pixel
         At every so many pixels the structure of the background is measured outside the footprints;
         it is subtracted, see `bayesfred.subtract_background`. By default nothing is.
+    noise_correlation_ratio : float
+        Of a frame whose neighbouring pixels share noise, see `bayesfred.CorrelatedNoise`; by
+        default pixels are independent.
     reject_outliers : bool
         Whether unmatched sources and spurious detections are left out, see
         `bayesfred.reject_outliers`, and hot pixels before anything is searched for. At the maximum
@@ -59,6 +62,7 @@ class FrameSettings(Section):
     flat: Name | None = None
     variance: Name | None = None
     background_scale: Positive | None = None
+    noise_correlation_ratio: Annotated[Float, Field(ge=0.1, le=10)] = 1.0
     reject_outliers: bool = False
 
     @property

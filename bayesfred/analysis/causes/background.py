@@ -78,7 +78,7 @@ def _uneven(
 
 def _structured(context: Context, scale: float | None) -> str:
     """What to do about structure that no polynomial follows."""
-    if isinstance(context.posterior.noise, SubtractedNoise):
+    if isinstance(context.posterior.noise.pixelwise, SubtractedNoise):
         return f"narrow frame.background_scale{f', to {scale:g}' if scale else ''}"
     if scale:
         return f"set frame.background_scale = {scale:g}"

@@ -72,8 +72,8 @@ class Context:
 
     @cached_property
     def noise(self) -> Noise:
-        """That of the counts, with the model error."""
-        return self.posterior.noise_at(self.params)
+        """That of every pixel's counts by themselves, with the model error."""
+        return self.posterior.noise_at(self.params).pixelwise
 
     def corrected_by(self, change: Floats) -> "Context":
         """What is left if so many more counts are expected; a tenth of what were, at the least."""

@@ -13,7 +13,7 @@ from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.common import common_pattern
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
-from bayesfred.model.noise import PoissonNoise
+from bayesfred.model.noise import PoissonNoise, correlation_ratio
 
 FEWEST_FULL = 3  # equal pixels at the top that are a pile
 UNLIKELY = 1e-6  # chance of such a pile
@@ -165,18 +165,21 @@ def lines(context: Context) -> tuple[list[Finding], Context]:
 def correlated_pixels(shared: SharedNoise) -> Cause:
     """Noise that neighbouring pixels share, about which hardly anything else can be said."""
     along_u, along_v = shared.along
+    taken = f", not {shared.known:g} times" if shared.known != 1.0 else ""
     return Cause(
         "correlated pixels", 1.0,
         f"neighbouring pixels between the sources share noise (correlation {along_u:.2f} along u, "
         f"{along_v:.2f} along v), as in frames that were resampled, smoothed or sharpened: errors "
-        f"of positions are {shared.factor:.2g} times those with independent pixels",
-        "fit the frame as the detector recorded it",
+        f"of positions are {shared.ratio:.2g} times those with independent pixels{taken}",
+        f"set frame.noise_correlation_ratio = {shared.ratio:.2g}, or fit the frame as the detector "
+        "recorded it",
     )  # fmt: skip
 
 
 def background_and_noise(context: Context) -> Iterator[Finding]:
     """What pixels far from all sources say of the background and of the noise."""
-    shared = shared_noise(context.z, context.quiet, context.light.width)
+    known = correlation_ratio(context.posterior.noise)
+    shared = shared_noise(context.z, context.quiet, context.light.width, known)
     if shared is None:
         yield from _independent(context)
         return
@@ -204,7 +207,7 @@ def _independent(context: Context) -> Iterator[Finding]:
 
 def _level(context: Context) -> float:
     """Counts over expected counts of the quiet pixels: a wrong level is no wrong noise."""
-    noise = context.posterior.noise
+    noise = context.posterior.noise.pixelwise
     if not isinstance(noise, PoissonNoise):
         return 1.0
     mu = float(np.mean(noise.counts_variance(context.expected, context.level)[context.quiet]))
@@ -244,9 +247,9 @@ def _noise(context: Context, ratio: float) -> Finding:
     the noise is a share of the counts. The fainter half of the sources decides, for misfits of
     another kind grow with the flux.
     """
-    if not isinstance(context.posterior.noise, PoissonNoise):
+    noise, mean, level = context.posterior.noise.pixelwise, context.expected, context.level
+    if not isinstance(noise, PoissonNoise):
         return _finding_of_noise(context, "over-dispersion", ratio, np.ones(1))
-    noise, mean, level = context.posterior.noise, context.expected, context.level
     mu = noise.counts_variance(mean, level)
     b = np.maximum(noise.counts_variance(np.full_like(mean, level), level), 1e-9)
     lit = context.used & (context.distance <= 1.5 * context.light.width) & (mu > 1.5 * b)
@@ -285,7 +288,7 @@ def _finding_of_noise(context: Context, name: str, ratio: float, growth: Floats)
         remedy = f"check frame.gain: {1.0 / ratio:.3g} times the present one would cure it"
     elif name == "read noise":
         sentence = f"{found}, and at bright sources with less: some variance is constant"
-        known = float(np.median(getattr(context.posterior.noise, "read_noise", 0.0)))
+        known = float(np.median(getattr(context.posterior.noise.pixelwise, "read_noise", 0.0)))
         remedy = f"set noise.read_noise to about {math.hypot(variance**0.5, known):.3g}"
     elif name == "pedestal":
         sentence = f"{found}, and at bright sources with more: {variance:.3g} counts are no photons"

@@ -3,6 +3,12 @@
 `protocol.py` says what a noise model is.
 """
 
+from bayesfred.model.noise.correlated import (
+    CorrelatedNoise,
+    correlated_terms,
+    correlation_ratio,
+    with_model_error,
+)
 from bayesfred.model.noise.flat_field import FlatFieldNoise
 from bayesfred.model.noise.gaussian import BackgroundNoise, GaussianNoise
 from bayesfred.model.noise.model_error import ModelErrorNoise, model_error_terms
@@ -13,12 +19,16 @@ from bayesfred.model.noise.subtracted import SubtractedNoise
 
 __all__ = [
     "BackgroundNoise",
+    "CorrelatedNoise",
     "FlatFieldNoise",
     "GaussianNoise",
     "ModelErrorNoise",
     "Noise",
     "PoissonNoise",
     "SubtractedNoise",
+    "correlated_terms",
+    "correlation_ratio",
     "model_error_terms",
     "simulate",
+    "with_model_error",
 ]

@@ -27,6 +27,11 @@ class Noise(Protocol):
         """Whether counts are integers that have probabilities; others have densities."""
         return False
 
+    @property
+    def pixelwise(self) -> "Noise":
+        """The noise of every pixel by itself."""
+        return self
+
     @abstractmethod
     def terms(self, values: Floats) -> Any:
         """The compiled half for a frame of padded rows, MASKED where a pixel is not used."""
