@@ -6,6 +6,9 @@ Far from the maximum the steps of blended sources go too far, again and again. S
 a step is halved until log L + log p(log F) is not lower than before: it is a direction uphill, as
 its matrix is positive definite.
 
+Where one of two maxima of a shift is about to end the log-density is so flat that steps crawl, and
+after some more visits a place near enough will do: log p is off by some 0.01.
+
 Nearby. Where e and G - H of `gradient.py` are known from other parameters nearby the search ends
 early. Let g be the gradient and d the step that is left. Then at the maximum log L + log p is
 higher by 1/2 g d, and -1/2 log det H by e d. Of d a step leaves the share sqrt(rate), by which
@@ -46,6 +49,7 @@ CLOSE = 1e-16  # square of a distance from the maximum, in standard deviations, 
 VAGUE = 0.2  # of a change of log det H, since e depends on the parameters
 PATIENT, HALVES = 10, 8  # visits before steps are only taken uphill; how often one is halved
 CERTAIN = 0.01  # square of the distance from which on they are anyway
+ENDLESS, FLAT = 60, 1e-3  # visits after which so small a square of the distance will do
 MOST_VISITS = 200  # of all pixels in a search
 VISITS = 8  # after which one does not end early
 ENOUGH = 3e-6  # error of the log-likelihood for every source, with which a search ends early
@@ -311,6 +315,8 @@ def maximize(frame, parameters, cluster, known, h):
         if visit >= PATIENT and size > 1 and distance > CERTAIN:
             way = step, shares
             value = _turn_back(frame, parameters, cluster, way, value)
+        if visit > ENDLESS and size > 1 and distance <= FLAT:
+            return 0.0 if cholesky(h, group) else math.nan
         left = distance * min(rate, 1.0)
         converged = left <= close or (early and 0.5 * left * math.sqrt(rate) <= enough)
     return math.nan
