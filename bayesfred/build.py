@@ -140,7 +140,7 @@ def noise_given(
             )
     if maps.flat is not None:
         noise = FlatFieldNoise(cast(PoissonNoise, noise), maps.flat)
-    if run.frame.noise_correlation_ratio != 1.0:
+    if run.frame.noise_correlation_ratio is not None:
         noise = CorrelatedNoise(noise, run.frame.noise_correlation_ratio)
     return noise, line
 

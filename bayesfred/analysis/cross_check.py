@@ -62,7 +62,14 @@ from bayesfred.analysis.halves import (
     predicted,
 )
 from bayesfred.analysis.held_scatter import hold_scatter
-from bayesfred.analysis.joint_folds import AnyPosterior, fold_frames, require_visible
+from bayesfred.analysis.joint_folds import (
+    AnyPosterior,
+    fold_frames,
+    frame_views,
+    require_visible,
+)
+from bayesfred.analysis.neighbours import Neighbours, neighbours
+from bayesfred.analysis.sources import source_table
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.threads import one_blas_thread
@@ -113,6 +120,9 @@ class CrossCheck:
         Maximum of each half.
     frames : mapping of str to FrameCheck
         What the halves say of each of several frames.
+    neighbours : Neighbours or None
+        How far neighbouring sources are displaced alike, which halves do not see: in the frame in
+        which it is most certain. None where sources are too few.
     """
 
     displacement: Agreement
@@ -123,6 +133,7 @@ class CrossCheck:
     sources: Ints
     params: Floats
     frames: Mapping[str, FrameCheck] = field(default_factory=dict)
+    neighbours: Neighbours | None = None
 
     @property
     def displacement_p(self) -> float:
@@ -150,7 +161,7 @@ class CrossCheck:
     @property
     def verdict(self) -> Verdict:
         """Whether the errors are too small, right or too large."""
-        return self.deciding.verdict
+        return "too small" if self._alike else self.deciding.verdict
 
     @property
     def holds(self) -> bool:
@@ -166,9 +177,21 @@ class CrossCheck:
         scaling = f"multiply them by {a.factor:.2f} ({low:.2f} to {high:.2f})"
         power = f"errors too small by a factor {a.detectable:.2f} would be found in 90 % of cases"
         found = f"{of}: chi-square {a.chi2:.1f} for {a.dof} degrees of freedom, p = {a.p:.2g}"
+        if self._alike and self.neighbours is not None:
+            return (
+                f"the errors are too small: multiply them by some {self.neighbours.factor:.2g}; "
+                "neighbouring sources are displaced alike (correlation "
+                f"{self.neighbours.correlation:.2f}), which both halves have in common ({found})"
+            )
         if self.holds:
             return f"the errors are right: the halves agree ({found}); {power}"
         return f"the errors are {self.verdict}: {scaling}; {found}{self._by_frame}; {power}"
+
+    @property
+    def _alike(self) -> bool:
+        """Whether the halves have something in common, unless they disagree even so."""
+        alike = self.neighbours is not None and self.neighbours.alike
+        return alike and self.deciding.verdict != "too small"
 
     @property
     def _by_frame(self) -> str:
@@ -235,9 +258,12 @@ def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None)
 
     Notes
     -----
-    What both halves have in common, such as a wrong PSF that moves all images alike, a wrong plate
-    scale of the catalogue, a field that no term describes or a frame of another instrument, it does
-    not see: `diagnose` tells whether frames agree about what they share. Errors of the linear
+    Halves alternate over the field, and what displaces neighbouring sources alike they have in
+    common. Where displacements show such a thing the verdict is "too small" for that.
+
+    What else both have in common, such as a wrong PSF that moves all images alike, a wrong plate
+    scale of the catalogue, a field that no term describes or a frame of another instrument, they do
+    not show: `diagnose` tells whether frames agree about what they share. Errors of the linear
     approximation are neglected. The verdict is "right" where both probabilities lie between 0.01
     and 0.99. With `position_scatter` the scatter is estimated from the same sources: with n sources
     and k degrees of freedom chi-square varies less, by a factor of about 1 - k / 2n in the
@@ -287,4 +313,17 @@ def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None)
             sources=folds.sources,
             params=np.array([one.params, two.params]),
             frames=frames,
+            neighbours=_most_alike(posterior, whole.params),
         )
+
+
+def _most_alike(posterior: AnyPosterior, params: Floats) -> Neighbours | None:
+    """Of the neighbours of each frame those that are most certain to be displaced alike."""
+    found = []
+    for view in frame_views(posterior):
+        own = view.to_frame @ params
+        named = dict(zip(view.posterior.parameter_names, own, strict=True))
+        table = source_table(view.posterior, own)
+        found.append(neighbours(table, float(named.get("position_scatter", 0.0))))
+    known = [each for each in found if each is not None]
+    return max(known, key=lambda each: each.correlation / each.sd, default=None)

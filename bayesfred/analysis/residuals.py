@@ -11,7 +11,7 @@ and along v, is zero for independent noise, with standard deviation 1/sqrt(pairs
 that is wrong, light of unknown sources, and resampled pixels.
 
 What a fit absorbs is taken off (`bayesfred.analysis.absorbed`). `bayesfred.analysis.pixel_phase`
-adds a check of the sources' displacements.
+and `bayesfred.analysis.neighbours` add checks of the sources' displacements.
 
 References
 ----------
@@ -28,6 +28,7 @@ from scipy import special
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.absorbed import absorbed
 from bayesfred.analysis.checks import Check, deviate, not_tested
+from bayesfred.analysis.neighbours import Neighbours, neighbours, neighbours_check
 from bayesfred.analysis.pixel_phase import PixelPhase, phase_check, pixel_phase
 from bayesfred.analysis.score_tests import ScoreTests, score_tests
 from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
@@ -64,6 +65,8 @@ class Residuals:
         Of every source.
     shared : SharedNoise or None
         How far neighbouring pixels between the sources are correlated, where that matters.
+    neighbours : Neighbours or None
+        How far neighbouring sources are displaced alike; None where they are too few.
     checks : tuple of Check
         All of these in one number each.
     """
@@ -74,6 +77,7 @@ class Residuals:
     scores: ScoreTests
     tests: SourceTests
     shared: SharedNoise | None
+    neighbours: Neighbours | None
     checks: tuple[Check, ...]
 
 
@@ -105,6 +109,8 @@ def judge_residuals(
     sources = tabulate(posterior, fits)
     sources["failed"] = tests.failed
     z, quiet = _standardised(posterior, params, fits)
+    named = dict(zip(posterior.parameter_names, params, strict=True))
+    alike = neighbours(sources, float(named.get("position_scatter", 0.0)))
     return Residuals(
         sources,
         pit,
@@ -112,12 +118,14 @@ def judge_residuals(
         scores,
         tests,
         shared_noise(z, quiet, image_width(posterior, params), correlation_ratio(posterior.noise)),
+        alike,
         (
             *scores.checks,
             *tests.checks,
             pit_check(pit),
             *_whiteness(posterior, z, fits, taken.modes),
             *(phase_check(phase, axis) for phase, axis in zip(phases, "uv", strict=True)),
+            neighbours_check(alike),
         ),
     )
 

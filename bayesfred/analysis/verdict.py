@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 
 from bayesfred._typing import Floats
-from bayesfred.analysis.causes import Cause, correlated_pixels, find_causes, hidden_causes
+from bayesfred.analysis.causes import (
+    Cause,
+    correlated_pixels,
+    displaced_alike,
+    find_causes,
+    hidden_causes,
+)
 from bayesfred.analysis.causes.cause import psf_remedy
 from bayesfred.analysis.residuals import Residuals
 from bayesfred.model.noise import SubtractedNoise
@@ -75,7 +81,8 @@ def judge_fit(
 
     It does where deviance and Pearson's statistic are within 5 standard deviations of their
     expectations, enough sources are matched (see `bayesfred.optimize.matched`), neither a score
-    test nor a source fails, pixels between the sources share no noise, the maximum was not found by
+    test nor a source fails, pixels between the sources share no noise, neighbouring sources are not
+    displaced alike, the maximum was not found by
     rejecting a large part of the sources, and no other pose of a frame on the sky fits as well.
     Of true models at most 1 % fail, all tests together.
 
@@ -107,6 +114,8 @@ def judge_fit(
         elif residuals.shared is not None:
             causes = (correlated_pixels(residuals.shared),)
         causes = causes or hidden_causes(posterior, params, residuals.scores, residuals.tests)
+        if consist and residuals.neighbours is not None and residuals.neighbours.alike:
+            causes = (*causes, displaced_alike(residuals.neighbours))
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
     if fits and not estimate.fits_data:
@@ -262,6 +271,8 @@ def _failures(residuals: Residuals) -> str:
         f"{lead.name} is {abs(lead.z):.0f} standard deviations from zero score"
         for lead in scores.leading[:1]
     ]
+    if residuals.neighbours is not None and residuals.neighbours.alike:
+        parts.append("neighbouring sources are displaced alike")
     if tests.failed.any():
         parts.append(f"{tests.failed.sum()} of {tests.failed.size} sources do not fit")
     parts += [

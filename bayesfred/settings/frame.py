@@ -43,7 +43,7 @@ class FrameSettings(Section):
     background_scale : float, optional, recorded pixel
         At every so many pixels the structure of the background is measured outside the footprints;
         it is subtracted, see `bayesfred.subtract_background`. By default nothing is.
-    noise_correlation_ratio : float
+    noise_correlation_ratio : float, optional
         Of a frame whose neighbouring pixels share noise, see `bayesfred.CorrelatedNoise`; by
         default pixels are independent.
     reject_outliers : bool
@@ -62,7 +62,7 @@ class FrameSettings(Section):
     flat: Name | None = None
     variance: Name | None = None
     background_scale: Positive | None = None
-    noise_correlation_ratio: Annotated[Float, Field(ge=0.1, le=10)] = 1.0
+    noise_correlation_ratio: Annotated[Float, Field(ge=0.1, le=10)] | None = None
     reject_outliers: bool = False
 
     @property

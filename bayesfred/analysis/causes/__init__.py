@@ -32,7 +32,7 @@ P. McCullagh, J. A. Nelder (1989), Generalized Linear Models, chapter 2: analysi
 
 from bayesfred.analysis.causes.cause import Cause
 from bayesfred.analysis.causes.find import find_causes
-from bayesfred.analysis.causes.pixels import correlated_pixels
+from bayesfred.analysis.causes.pixels import correlated_pixels, displaced_alike
 from bayesfred.analysis.causes.scores import hidden_causes
 
-__all__ = ["Cause", "correlated_pixels", "find_causes", "hidden_causes"]
+__all__ = ["Cause", "correlated_pixels", "displaced_alike", "find_causes", "hidden_causes"]

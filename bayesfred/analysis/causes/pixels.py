@@ -12,6 +12,7 @@ from bayesfred.analysis.causes.background import background_between, background_
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.common import common_pattern
 from bayesfred.analysis.causes.context import Context
+from bayesfred.analysis.neighbours import Neighbours
 from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
 from bayesfred.model.noise import PoissonNoise, correlation_ratio
 
@@ -173,6 +174,18 @@ def correlated_pixels(shared: SharedNoise) -> Cause:
         f"of positions are {shared.ratio:.2g} times those with independent pixels{taken}",
         f"set frame.noise_correlation_ratio = {shared.ratio:.2g}, or fit the frame as the detector "
         "recorded it",
+    )  # fmt: skip
+
+
+def displaced_alike(found: Neighbours) -> Cause:
+    """What displaces neighbouring sources alike, and is in no term of the distortion."""
+    return Cause(
+        "displaced neighbours", 1.0,
+        f"neighbouring sources are displaced alike (correlation {found.correlation:.2f}), by what "
+        "is finer than the distortion's terms and not independent from source to source, such as "
+        "ghosts or the target's own errors: errors of the coefficients are some "
+        f"{found.factor:.2g} times these",
+        "add terms to the distortion, or take its errors for so much larger",
     )  # fmt: skip
 
 

@@ -1,0 +1,126 @@
+"""Displacements of neighbouring sources, which have nothing in common if the model is true.
+
+Whatever displaces sources apart from noise is taken for independent from source to source, by
+`position_scatter` or, without it, by nothing at all. A distortion finer than the terms, ghosts
+whose light has a slope, or a target that was machined in strokes displace neighbours alike.
+Coefficients of terms that change little from one source to the next then err as if there were fewer
+sources: with the correlation rho(l) of sources at a distance l their variance is 1 + sum_l rho(l)
+times that of independent ones. The sum is taken up to where the correlation ends.
+
+Halves that alternate do not see it, as `cross_check` takes them: both have it.
+
+References
+----------
+P. A. P. Moran (1950), Biometrika 37, 17: the mean product of neighbours.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import spatial
+
+from bayesfred._typing import Floats, Ints
+from bayesfred.analysis.checks import Check, not_tested
+from bayesfred.io.summary_table import Table
+
+FEWEST = 20  # sources
+OUTLYING = 3.0  # standard deviations, as which a displacement counts at most
+NOTICEABLE = 5.0  # standard deviations of the correlation
+LONGEST = 2.0  # median distances between neighbours, beyond which two are none
+LAGS = 8  # median distances to which the correlation is followed
+
+NAME = "displacement of neighbours"
+
+
+class Neighbours(NamedTuple):
+    """How far neighbouring sources are displaced alike.
+
+    Attributes
+    ----------
+    correlation : float
+        Of the displacements of neighbours.
+    sd : float
+        Its standard deviation if they have nothing in common.
+    factor : float
+        Errors of coefficients over those with sources that are displaced independently.
+    """
+
+    correlation: float
+    sd: float
+    factor: float
+
+    @property
+    def alike(self) -> bool:
+        """Whether they are."""
+        return self.correlation > NOTICEABLE * self.sd
+
+    @property
+    def check(self) -> Check:
+        """The correlation among the checks."""
+        return Check(
+            NAME, self.correlation, 0.0, self.sd, self.correlation / self.sd,
+            "correlation of the displacements of neighbouring sources",
+        )  # fmt: skip
+
+
+def neighbours(sources: Table, scatter: float) -> Neighbours | None:
+    """Compare the displacements of isolated sources with those of their neighbours.
+
+    Parameters
+    ----------
+    sources : astropy.table.Table
+        As `source_table` has them.
+    scatter : float, pixel
+        The scale of their own scatter; 0 without.
+
+    Returns
+    -------
+    Neighbours or None
+        None where they are too few.
+    """
+    columns = ("u", "v", "du", "dv", "du_sd", "dv_sd")
+    table = np.stack([np.asarray(sources[name], np.float64) for name in columns])
+    table = table[:, np.isfinite(table).all(axis=0) & np.asarray(sources["isolated"], bool)]
+    places = table[:2].T
+    if len(places) < FEWEST:
+        return None
+    try:
+        pairs = _neighbours(places)
+    except spatial.QhullError:  # on a line
+        return None
+    z = np.clip(table[2:4] / np.hypot(table[4:], scatter), -OUTLYING, OUTLYING)
+    z -= z.mean(axis=1, keepdims=True)
+    z /= np.maximum(z.std(axis=1, keepdims=True), 1e-300)
+    found = Neighbours(_mean_product(z, pairs), (2.0 * len(pairs)) ** -0.5, 1.0)
+    return found._replace(factor=_factor(z, places, pairs)) if found.alike else found
+
+
+def neighbours_check(found: Neighbours | None) -> Check:
+    """The row of the checks."""
+    return not_tested(NAME, "too few isolated sources") if found is None else found.check
+
+
+def _neighbours(places: Floats) -> Ints:
+    """Pairs of neighbours, shape (n, 2): sides of Delaunay's triangles that are not long."""
+    corners = spatial.Delaunay(places).simplices
+    sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    sides = np.unique(np.sort(sides, axis=1), axis=0)
+    length = np.hypot(*(places[sides[:, 0]] - places[sides[:, 1]]).T)
+    return np.asarray(sides[length <= LONGEST * np.median(length)])
+
+
+def _mean_product(z: Floats, pairs: Ints) -> float:
+    return float(np.mean(z[:, pairs[:, 0]] * z[:, pairs[:, 1]]))
+
+
+def _factor(z: Floats, places: Floats, pairs: Ints) -> float:
+    """Root of 1 + sum of the correlations, up to where they end."""
+    step = float(np.median(np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)))
+    tree, total, before = spatial.cKDTree(places), 1.0, 0.0
+    for lag in range(1, LAGS + 1):
+        near = tree.query_pairs((lag + 0.5) * step, output_type="ndarray")
+        products = float(np.sum(z[:, near[:, 0]] * z[:, near[:, 1]]))
+        if products <= before:
+            break
+        total, before = 1.0 + products / len(places), products
+    return float(total**0.5)
