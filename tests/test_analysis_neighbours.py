@@ -110,5 +110,7 @@ def test_the_verdict_names_it_and_cross_check_does_not_trust_halves() -> None:
         assert "neighbouring sources are displaced alike" in verdict.sentence
         assert found.verdict == "too small" and not found.holds
         assert "which both halves have in common" in found.message
+        assert found.record()["neighbours_correlation"] > 0.3
+        assert found.record()["neighbours_factor"] > 1.3
         # the control: the halves alone are content, or call the errors too large
         assert replace(found, neighbours=None).verdict != "too small"

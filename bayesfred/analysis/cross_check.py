@@ -207,7 +207,8 @@ class CrossCheck:
 
         Each agreement has `p`, `chi2`, `dof`, `factor`, `factor_low`, `factor_high` and
         `detectable`; of the positions in each half there is the root mean square in standard
-        deviations. Of several frames, `frames` has by name `displacement_p`, `displacement_factor`
+        deviations. `neighbours_correlation` and `neighbours_factor` are those of neighbouring
+        sources' displacements. Of several frames, `frames` has by name `displacement_p`, `displacement_factor`
         and `positions_rms_z`.
         """
         record: dict[str, Any] = {"verdict": self.verdict, "message": self.message}
@@ -221,6 +222,9 @@ class CrossCheck:
         record["positions_rms_z"] = [a.factor for a in self.positions]
         record["displacement_rms"] = self.displacement_rms
         record["displacement_expected"] = self.displacement_expected
+        if self.neighbours is not None:
+            record["neighbours_correlation"] = self.neighbours.correlation
+            record["neighbours_factor"] = self.neighbours.factor
         if self.frames:
             record["frames"] = {
                 name: {
