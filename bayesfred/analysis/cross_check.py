@@ -207,9 +207,9 @@ class CrossCheck:
 
         Each agreement has `p`, `chi2`, `dof`, `factor`, `factor_low`, `factor_high` and
         `detectable`; of the positions in each half there is the root mean square in standard
-        deviations. `neighbours_correlation` and `neighbours_factor` are those of neighbouring
-        sources' displacements. Of several frames, `frames` has by name `displacement_p`, `displacement_factor`
-        and `positions_rms_z`.
+        deviations. `neighbours_correlation` and `neighbours_factor` are of the displacements of
+        neighbouring sources. Of several frames, `frames` has by name `displacement_p`,
+        `displacement_factor` and `positions_rms_z`.
         """
         record: dict[str, Any] = {"verdict": self.verdict, "message": self.message}
         for name, a in (("displacement", self.displacement), ("coefficients", self.coefficients)):
