@@ -122,10 +122,10 @@ def judge_residuals(
         (
             *scores.checks,
             *tests.checks,
+            neighbours_check(alike),
             pit_check(pit),
             *_whiteness(posterior, z, fits, taken.modes),
             *(phase_check(phase, axis) for phase, axis in zip(phases, "uv", strict=True)),
-            neighbours_check(alike),
         ),
     )
 
