@@ -76,6 +76,21 @@ def test_what_is_not_told() -> None:
     assert neighbours(table, 0.0) is None
 
 
+def test_a_displacement_counts_in_units_of_its_error_and_of_the_scatter() -> None:
+    rng = np.random.default_rng(943)
+    places, moved = rng.uniform(-100.0, 100.0, (200, 2)), 0.05 * rng.standard_t(3.0, (200, 2))
+    table = table_of(places, moved)
+    for name in ("du_sd", "dv_sd"):
+        table[name] = rng.uniform(0.005, 0.1, 200)
+    wider = table.copy()
+    for name in ("du_sd", "dv_sd"):
+        wider[name] = np.hypot(table[name], 0.05)
+    found, same, other = neighbours(table, 0.05), neighbours(wider, 0.0), neighbours(table, 0.0)
+    assert found is not None and same is not None and other is not None
+    assert found.correlation == pytest.approx(same.correlation, rel=1e-12)
+    assert abs(found.correlation - other.correlation) > 1e-3
+
+
 def pinholes(seed: int, *, ripple: float, scatter: float = 0.0) -> bf.Posterior:
     """A target whose marks were machined with a ripple, or independently off their places."""
     rng, detector = np.random.default_rng(seed), bf.Detector((200, 210))

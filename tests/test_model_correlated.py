@@ -234,8 +234,9 @@ def test_the_verdict_asks_for_the_ratio_and_is_content_with_it() -> None:
     assert verdict.fits_data and shared is None
 
 
-@pytest.mark.parametrize("ratio", [1.4, 2.2])
+@pytest.mark.parametrize("ratio", [1.4, 2.2, 3.1])
 def test_a_wrong_ratio_is_told(ratio: float) -> None:
+    """Also one that is the square of the true one."""
     posterior, _ = resampled(1)
     verdict, shared = judged(replace(posterior, noise=bf.CorrelatedNoise(posterior.noise, ratio)))
     assert shared is not None and shared.known == ratio
