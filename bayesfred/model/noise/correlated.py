@@ -34,7 +34,6 @@ from bayesfred.model.kernels.noise_dispatch import (
     information,
     level_derivatives,
     log_density,
-    spread,
     summed,
     unreached,
 )
@@ -62,10 +61,6 @@ class CorrelatedTerms(NamedTuple):
     @staticmethod
     def information(noise: Any, mu: Any, light: Any, p: Any) -> Any:
         return noise.share * information(noise.base, mu, light, p)
-
-    @staticmethod
-    def spread(noise: Any, mu: Any, p: Any) -> Any:
-        return spread(noise.base, mu, p)
 
     @staticmethod
     def summed(noise: Any, values: Any, light: Any, mean: Any, place: Any) -> Any:
