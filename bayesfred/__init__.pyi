@@ -5,6 +5,7 @@ from .analysis.comparison import Comparison, compare
 from .analysis.cross_check import CrossCheck, cross_check
 from .analysis.design import Design, design
 from .analysis.diagnostics import Diagnostics, diagnose
+from .analysis.displacements import marginalize_displacements
 from .analysis.evidence import Evidence, log_evidence
 from .analysis.field import DisplacementField, displacement_field
 from .analysis.noise_study import NoiseStudy, noise_study
@@ -117,6 +118,7 @@ __all__ = [
     "invert_dots",
     "laplace",
     "log_evidence",
+    "marginalize_displacements",
     "marginalize_psf",
     "measure_psf",
     "noise_study",

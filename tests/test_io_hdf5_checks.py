@@ -285,15 +285,15 @@ def deep_groups(file: h5py.File) -> None:
 
 
 @harm(
-    "of newer schema 10, expected bayesfred chain of schema 9: read it with the version that wrote "
-    "it"
+    "of newer schema 11, expected bayesfred chain of schema 10: read it with the version that "
+    "wrote it"
 )
 def newer_schema(file: h5py.File) -> None:
     file.attrs["schema"] = hdf5_checks.SCHEMA + 1
     file["ensemble_0/unheard_of"] = ["text"]
 
 
-@harm("of schema 2, expected bayesfred chain of schema 9: remake it")
+@harm("of schema 2, expected bayesfred chain of schema 10: remake it")
 def older_schema(file: h5py.File) -> None:
     file.attrs["schema"] = 2
 

@@ -197,7 +197,7 @@ class Banana:
     """
 
     hyperparameters: ClassVar[tuple[str, ...]] = ()
-    psf_errors = None
+    added_covariance = None
 
     def __init__(self, k: int) -> None:
         from bayesfred.model.shared_parameters import Part
@@ -221,7 +221,7 @@ class Funnel:
     """The same with scales: tau_i has a Gamma distribution, nu_i - phi is tau_i times a normal."""
 
     hyperparameters: ClassVar[tuple[str, ...]] = ()
-    psf_errors = None
+    added_covariance = None
 
     def __init__(self, k: int) -> None:
         from bayesfred.model.shared_parameters import Part

@@ -18,6 +18,7 @@ import numpy as np
 
 from bayesfred._typing import Floats
 from bayesfred.analysis.sources import SourceFits
+from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.posterior import Posterior
 
 __all__ = ["Absorbed", "absorbed", "responses"]
@@ -33,7 +34,7 @@ class Absorbed(NamedTuple):
     alone: Floats  # (s, 4, 4) K^-1, what of it remains if the parameters are known
 
 
-def responses(posterior: Posterior, params: Floats, fits: SourceFits) -> Floats:
+def responses(posterior: Posterior | FrameLikelihood, params: Floats, fits: SourceFits) -> Floats:
     """Changes of the sources' template coefficients by the parameters, shape (s, 4, d)."""
     model, sources = posterior.model, posterior.model.sources
     out = np.zeros((fits.fluxes.size, 4, params.size))

@@ -199,7 +199,10 @@ def _of_degree(posterior: Posterior, degree: int) -> Posterior:
     model = replace(posterior.model, distortion=PolynomialDistortion.polynomial(degree))
     terms = set(posterior.model.distortion.names) - set(model.distortion.names)
     prior = {name: given for name, given in posterior.prior.items() if name not in terms}
-    return replace(posterior, model=model, prior=prior, extrapolation=None, psf_errors=None)
+    return replace(
+        posterior, model=model, prior=prior, extrapolation=None,
+        psf_errors=None, displacement_errors=None,
+    )  # fmt: skip
 
 
 def _carried(fit: _Fit, to: Posterior) -> Floats:

@@ -54,6 +54,7 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.analysis.agreement import Agreement, Verdict
+from bayesfred.analysis.displacements import displaced_neighbours
 from bayesfred.analysis.halves import (
     coefficients,
     difference,
@@ -68,8 +69,8 @@ from bayesfred.analysis.joint_folds import (
     frame_views,
     require_visible,
 )
-from bayesfred.analysis.neighbours import Neighbours, neighbours
-from bayesfred.analysis.sources import source_table
+from bayesfred.analysis.neighbours import Neighbours
+from bayesfred.analysis.sources import fit_sources, tabulate
 from bayesfred.errors import InputError
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.threads import one_blas_thread
@@ -263,7 +264,8 @@ def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None)
     Notes
     -----
     Halves alternate over the field, and what displaces neighbouring sources alike they have in
-    common. Where displacements show such a thing the verdict is "too small" for that.
+    common. Where displacements show such a thing the verdict is "too small" for that, unless
+    `marginalize_displacements` has put it into the errors.
 
     What else both have in common, such as a wrong PSF that moves all images alike, a wrong plate
     scale of the catalogue, a field that no term describes or a frame of another instrument, they do
@@ -291,7 +293,7 @@ def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None)
         fixed, start = hold_scatter(posterior, whole)
         one, two = (fit_half(fixed, folds, k, start) for k in (0, 1))
         moving = coefficients(fixed)
-        z, directions = difference(fixed, (one, two), start, moving)
+        z, directions = difference(fixed, folds, (one, two), start, moving)
         if not z.size:
             raise InputError(
                 f"catalogue: got {np.sum(folds.sources >= 0)} sources, half of which determine no "
@@ -300,7 +302,7 @@ def cross_check(posterior: AnyPosterior, *, estimate: MapEstimate | None = None)
         lens = z
         if isinstance(posterior, JointPosterior) and moving[: posterior.n_shared].any():
             moving[posterior.n_shared :] = False
-            lens = difference(fixed, (one, two), start, moving)[0]
+            lens = difference(fixed, folds, (one, two), start, moving)[0]
         whole_field, fields = displacements(posterior, whole.params, folds, z, directions)
         positions = [predicted(fixed, folds, k, other) for k, other in enumerate((two, one))]
         frames = {
@@ -326,8 +328,8 @@ def _most_alike(posterior: AnyPosterior, params: Floats) -> Neighbours | None:
     found = []
     for view in frame_views(posterior):
         own = view.to_frame @ params
-        named = dict(zip(view.posterior.parameter_names, own, strict=True))
-        table = source_table(view.posterior, own)
-        found.append(neighbours(table, float(named.get("position_scatter", 0.0))))
+        fits = fit_sources(view.posterior, own)
+        table = tabulate(view.posterior, fits)
+        found.append(displaced_neighbours(view.posterior, own, fits, table))
     known = [each for each in found if each is not None]
-    return max(known, key=lambda each: each.correlation / each.sd, default=None)
+    return max(known, key=lambda each: each.z, default=None)

@@ -136,7 +136,9 @@ def require_sources(folds: Folds) -> None:
 
 def _masked(posterior: Posterior, mask: Flags) -> Posterior:
     # the errors of a measured PSF are common to all folds
-    return replace(posterior, mask=mask, extrapolation=None, psf_errors=None)
+    return replace(
+        posterior, mask=mask, extrapolation=None, psf_errors=None, displacement_errors=None
+    )
 
 
 def _path(positions: Floats) -> Ints:

@@ -195,21 +195,21 @@ def _paraboloids(joint: JointPosterior, params: Floats, free: Flags) -> "_Parabo
         score = part.matrix.T @ gradient - gain @ (gradient[places] + slope[columns])
         told.append(0.5 * (shared + shared.T))
         pulls.append(score + told[-1] @ params[:p])
-        excess.append(_psf_excess(joint, name, told[-1]))
+        excess.append(_added(joint, name, told[-1]))
         volumes.append(float(np.linalg.slogdet(own)[1]))
     prior = np.diag(curvature[:p])
     pull = slope[:p] + prior @ params[:p]
     return _Paraboloids(told, pulls, excess, (prior, pull), volumes)
 
 
-def _psf_excess(joint: JointPosterior, name: str, told: Floats) -> Floats | None:
-    """What the errors of a frame's PSF add to the covariance of its score."""
-    errors = joint.frames[name].psf_errors
-    if errors is None:
+def _added(joint: JointPosterior, name: str, told: Floats) -> Floats | None:
+    """What errors that a frame's likelihood has not add to the covariance of its score."""
+    added = joint.frames[name].added_covariance
+    if added is None:
         return None
     moved = np.flatnonzero(joint.part_of(name).matrix.any(axis=1))
     back = np.linalg.pinv(joint.part_of(name).matrix[moved])
-    covariance = back @ errors.covariance[np.ix_(moved, moved)] @ back.T
+    covariance = back @ added[np.ix_(moved, moved)] @ back.T
     return np.asarray(told @ covariance @ told)
 
 

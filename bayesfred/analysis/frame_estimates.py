@@ -111,8 +111,8 @@ def frame_estimates(chain: Chain) -> FrameEstimates:
             score = score - cross @ (gradient[part.places] + slope[part.own])
             told = told - cross @ fisher[np.ix_(part.places, common)]
         step, covariance = _newton(score, told)
-        if frame.psf_errors is not None:
-            covariance = covariance + frame.psf_errors.covariance[np.ix_(common, common)]
+        if frame.added_covariance is not None:
+            covariance = covariance + frame.added_covariance[np.ix_(common, common)]
         here = joint.frame_params(name, params)[common]
         spread = joint.frame_params(name, draws)[:, common].std(axis=0, ddof=1)
         rows.append((here + step, np.sqrt(np.diag(covariance)), here, spread))

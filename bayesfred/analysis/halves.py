@@ -12,6 +12,10 @@ With C = L L^T and B = D^(-1/2) F L,
     a^T (D + F C F^T)^-1 a = y^T y - (B^T y)^T (1 + B^T B)^-1 B^T y,        y = D^(-1/2) a,
 
 which needs sums over sources alone. Those of several frames are added up.
+
+Displacements that neighbouring sources have in common, where they are in the errors, move both
+halves: what they add to the variance of the difference is added, and its directions made
+independent again. So far as both halves follow them alike it is less than nothing.
 """
 
 import math
@@ -30,7 +34,8 @@ from bayesfred.analysis.joint_folds import (
     columns_of,
     frame_views,
 )
-from bayesfred.analysis.sources import source_table
+from bayesfred.analysis.random_field import placed, shared_products
+from bayesfred.analysis.sources import fit_sources, source_table
 from bayesfred.errors import InputError
 from bayesfred.model.kernels.clusters import DOF
 from bayesfred.model.posterior import Posterior
@@ -136,13 +141,18 @@ def coefficients(posterior: AnyPosterior) -> Flags:
 
 
 def difference(
-    posterior: AnyPosterior, halves: Sequence[Half], start: Floats, some: Flags
+    posterior: AnyPosterior,
+    folds: FrameFolds,
+    halves: Sequence[Half],
+    start: Floats,
+    some: Flags,
 ) -> tuple[Floats, Floats]:
     """The halves' difference in its independent directions that the data know.
 
     Parameters
     ----------
     posterior : Posterior or JointPosterior
+    folds : FrameFolds
     halves : sequence of Half, length 2
     start : ndarray, shape (d,)
         The maximum of both.
@@ -166,19 +176,53 @@ def difference(
     first, second = (half.estimate[free] * scale for half in halves)
     both = np.linalg.pinv(one + two, rcond=SINGULAR, hermitian=True)
     known = one @ both @ two
-    known, pull = 0.5 * (known + known.T), two @ both @ first - one @ both @ second
+    known, pulls = 0.5 * (known + known.T), np.stack([two @ both, -one @ both])
     wanted = np.flatnonzero(some[free])
     others = np.setdiff1d(np.arange(free.sum()), wanted)
     inner = np.linalg.pinv(known[np.ix_(others, others)], rcond=SINGULAR, hermitian=True)
     through = known[np.ix_(wanted, others)] @ inner
     known = known[np.ix_(wanted, wanted)] - through @ known[np.ix_(others, wanted)]
-    pull = pull[wanted] - through @ pull[others]
+    pulls = pulls[:, wanted] - through @ pulls[:, others]
     values, vectors = np.linalg.eigh(known + prior[np.ix_(wanted, wanted)])
     usable = values > SINGULAR * values[-1]
     whiten = vectors[:, usable] / np.sqrt(values[usable])
     share, axes = np.linalg.eigh(whiten.T @ known @ whiten)
     axes, share = (whiten @ axes)[:, share > KNOWN], share[share > KNOWN]
-    return axes.T @ pull / np.sqrt(share), scale[wanted, None] * axes / np.sqrt(share)
+    axes = axes / np.sqrt(share)
+    pulls = axes.T @ pulls
+    z, directions = pulls[0] @ first + pulls[1] @ second, scale[wanted, None] * axes
+    moves = np.zeros((2, z.size, free.size))
+    moves[:, :, free] = pulls * scale
+    spread = np.eye(z.size) + _in_common(posterior, start, folds, moves)
+    lower = linalg.cholesky(spread, lower=True)
+    return linalg.solve_triangular(lower, z, lower=True), directions @ lower
+
+
+def _in_common(posterior: AnyPosterior, params: Floats, folds: FrameFolds, moves: Floats) -> Floats:
+    """What displacements that the halves' sources have in common add to the difference's variance.
+
+    Parameters
+    ----------
+    moves : ndarray, shape (2, k, d)
+        Of the difference by the gradient of each half's log-likelihood.
+
+    Returns
+    -------
+    ndarray, shape (k, k)
+    """
+    total = np.zeros((moves.shape[1], moves.shape[1]))
+    for view in frame_views(posterior):
+        frame, own = view.posterior, view.to_frame @ params
+        errors = frame.displacement_errors
+        if errors is None or errors.field is None:
+            continue
+        found = placed(frame, own, fit_sources(frame, own))
+        half = folds.frames[view.name].sources[found.number]
+        by_frame = moves @ view.to_frame.T
+        by_frame = np.where((half >= 0)[:, None, None], by_frame[half], 0.0)
+        by_source = found.pulls @ by_frame.swapaxes(1, 2)
+        total += shared_products(errors.field, found, by_source)
+    return total
 
 
 def displacements(

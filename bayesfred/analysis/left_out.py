@@ -146,7 +146,9 @@ def leave_out(
 
 
 def _seeing(posterior: Posterior, mask: Flags) -> Posterior:
-    return replace(posterior, mask=mask, extrapolation=None, psf_errors=None)
+    return replace(
+        posterior, mask=mask, extrapolation=None, psf_errors=None, displacement_errors=None
+    )
 
 
 def _fitted(rest: Posterior, estimate: MapEstimate) -> tuple[Posterior, MapEstimate]:

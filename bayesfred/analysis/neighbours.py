@@ -5,7 +5,9 @@ Whatever displaces sources apart from noise is taken for independent from source
 whose light has a slope, or a target that was machined in strokes displace neighbours alike.
 Coefficients of terms that change little from one source to the next then err as if there were fewer
 sources: with the correlation rho(l) of sources at a distance l their variance is 1 + sum_l rho(l)
-times that of independent ones. The sum is taken up to where the correlation ends.
+times that of independent ones. The sum is taken up to where the correlation ends. Where positions
+scatter, `marginalize_displacements` puts such a field into the errors; then neighbours are compared
+with what it lets expect.
 
 Halves that alternate do not see it, as `cross_check` takes them: both have it.
 
@@ -14,6 +16,7 @@ References
 P. A. P. Moran (1950), Biometrika 37, 17: the mean product of neighbours.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +30,7 @@ FEWEST = 20  # sources
 OUTLYING = 3.0  # standard deviations, as which a displacement counts at most
 NOTICEABLE = 5.0  # standard deviations of the correlation
 LONGEST = 2.0  # median distances between neighbours, beyond which two are none
-LAGS = 8  # median distances to which the correlation is followed
+FOLLOWED = 8  # median distances to which the correlation is followed
 
 NAME = "displacement of neighbours"
 
@@ -39,31 +42,41 @@ class Neighbours(NamedTuple):
     ----------
     correlation : float
         Of the displacements of neighbours.
+    expected : float
+        What it is if they have nothing in common but the field that is in the errors, if any.
     sd : float
-        Its standard deviation if they have nothing in common.
+        Its standard deviation then.
     factor : float
         Errors of coefficients over those with sources that are displaced independently.
     """
 
     correlation: float
+    expected: float
     sd: float
     factor: float
 
     @property
+    def z(self) -> float:
+        """By how many standard deviations they are displaced alike."""
+        return (self.correlation - self.expected) / self.sd
+
+    @property
     def alike(self) -> bool:
         """Whether they are."""
-        return self.correlation > NOTICEABLE * self.sd
+        return self.z > NOTICEABLE
 
     @property
     def check(self) -> Check:
         """The correlation among the checks."""
         return Check(
-            NAME, self.correlation, 0.0, self.sd, self.correlation / self.sd,
+            NAME, self.correlation, self.expected, self.sd, self.z,
             "correlation of the displacements of neighbouring sources",
         )  # fmt: skip
 
 
-def neighbours(sources: Table, scatter: float) -> Neighbours | None:
+def neighbours(
+    sources: Table, scatter: float, shared: Callable[[Ints], Floats] | None = None
+) -> Neighbours | None:
     """Compare the displacements of isolated sources with those of their neighbours.
 
     Parameters
@@ -72,6 +85,9 @@ def neighbours(sources: Table, scatter: float) -> Neighbours | None:
         As `source_table` has them.
     scatter : float, pixel
         The scale of their own scatter; 0 without.
+    shared : callable, optional
+        For pairs of sources, (p, 2), the covariance of their displacements along u and along v that
+        is in the errors already, (2, p), pixel^2.
 
     Returns
     -------
@@ -80,7 +96,8 @@ def neighbours(sources: Table, scatter: float) -> Neighbours | None:
     """
     columns = ("u", "v", "du", "dv", "du_sd", "dv_sd")
     table = np.stack([np.asarray(sources[name], np.float64) for name in columns])
-    table = table[:, np.isfinite(table).all(axis=0) & np.asarray(sources["isolated"], bool)]
+    told = np.isfinite(table).all(axis=0) & np.asarray(sources["isolated"], bool)
+    table, numbers = table[:, told], np.flatnonzero(told)
     places = table[:2].T
     if len(places) < FEWEST:
         return None
@@ -88,11 +105,23 @@ def neighbours(sources: Table, scatter: float) -> Neighbours | None:
         pairs = _neighbours(places)
     except spatial.QhullError:  # on a line
         return None
-    z = np.clip(table[2:4] / np.hypot(table[4:], scatter), -OUTLYING, OUTLYING)
+    errors = np.hypot(table[4:], scatter)
+    z = np.clip(table[2:4] / errors, -OUTLYING, OUTLYING)
     z -= z.mean(axis=1, keepdims=True)
-    z /= np.maximum(z.std(axis=1, keepdims=True), 1e-300)
-    found = Neighbours(_mean_product(z, pairs), (2.0 * len(pairs)) ** -0.5, 1.0)
+    spread = np.maximum(z.std(axis=1, keepdims=True), 1e-300)
+    expected = 0.0
+    if shared is not None:
+        units = errors * spread
+        units = units[:, pairs[:, 0]] * units[:, pairs[:, 1]]
+        expected = float(np.mean(shared(numbers[pairs]) / units))
+    z /= spread
+    found = Neighbours(_mean_product(z, pairs), expected, (2.0 * len(pairs)) ** -0.5, 1.0)
     return found._replace(factor=_factor(z, places, pairs)) if found.alike else found
+
+
+def distance_of_neighbours(places: Floats) -> float:
+    """The median distance between neighbours among some places, (n, 2)."""
+    return float(np.median(_lengths(places, _neighbours(places))))
 
 
 def neighbours_check(found: Neighbours | None) -> Check:
@@ -105,8 +134,12 @@ def _neighbours(places: Floats) -> Ints:
     corners = spatial.Delaunay(places).simplices
     sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     sides = np.unique(np.sort(sides, axis=1), axis=0)
-    length = np.hypot(*(places[sides[:, 0]] - places[sides[:, 1]]).T)
+    length = _lengths(places, sides)
     return np.asarray(sides[length <= LONGEST * np.median(length)])
+
+
+def _lengths(places: Floats, pairs: Ints) -> Floats:
+    return np.asarray(np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T))
 
 
 def _mean_product(z: Floats, pairs: Ints) -> float:
@@ -115,9 +148,9 @@ def _mean_product(z: Floats, pairs: Ints) -> float:
 
 def _factor(z: Floats, places: Floats, pairs: Ints) -> float:
     """Root of 1 + sum of the correlations, up to where they end."""
-    step = float(np.median(np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T)))
+    step = float(np.median(_lengths(places, pairs)))
     tree, total, before = spatial.cKDTree(places), 1.0, 0.0
-    for lag in range(1, LAGS + 1):
+    for lag in range(1, FOLLOWED + 1):
         near = tree.query_pairs((lag + 0.5) * step, output_type="ndarray")
         products = float(np.sum(z[:, near[:, 0]] * z[:, near[:, 1]]))
         if products <= before:

@@ -146,8 +146,8 @@ def laplace_error(posterior: Posterior, params: Floats, points: FieldPoints) -> 
     float, pixel
     """
     covariance = inverse(posterior.information(params))
-    if posterior.psf_errors is not None:
-        covariance = covariance + posterior.psf_errors.covariance
+    if posterior.added_covariance is not None:
+        covariance = covariance + posterior.added_covariance
     return field_error(
         points, displacement_covariance(posterior, params, covariance, points.u, points.v)
     )

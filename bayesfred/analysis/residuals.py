@@ -28,7 +28,8 @@ from scipy import special
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.absorbed import absorbed
 from bayesfred.analysis.checks import Check, deviate, not_tested
-from bayesfred.analysis.neighbours import Neighbours, neighbours, neighbours_check
+from bayesfred.analysis.displacements import displaced_neighbours
+from bayesfred.analysis.neighbours import Neighbours, neighbours_check
 from bayesfred.analysis.pixel_phase import PixelPhase, phase_check, pixel_phase
 from bayesfred.analysis.score_tests import ScoreTests, score_tests
 from bayesfred.analysis.shared_noise import SharedNoise, shared_noise
@@ -92,7 +93,7 @@ def judge_residuals(
     params : ndarray, shape (d,)
         The MAP.
     covariance : ndarray, shape (d, d)
-        Of the parameters.
+        Of the parameters, `displacement_errors` included.
     seed : int
         For the randomised PIT.
 
@@ -101,16 +102,17 @@ def judge_residuals(
     Residuals
     """
     fits = fit_sources(posterior, params)
+    if posterior.displacement_errors is not None:  # by which the fit follows no counts
+        covariance = covariance - posterior.displacement_errors.covariance
     taken = absorbed(posterior, params, covariance, fits)
     pit = randomised_pit(posterior, params, fits, seed=seed, leverage=taken.leverage)
     phases = pixel_phase(posterior, params, covariance, fits)
-    scores = score_tests(posterior, params)
+    scores = score_tests(posterior, params, fits)
     tests = source_tests(posterior, params, covariance, fits, taken)
     sources = tabulate(posterior, fits)
     sources["failed"] = tests.failed
     z, quiet = _standardised(posterior, params, fits)
-    named = dict(zip(posterior.parameter_names, params, strict=True))
-    alike = neighbours(sources, float(named.get("position_scatter", 0.0)))
+    alike = displaced_neighbours(posterior, params, fits, sources)
     return Residuals(
         sources,
         pit,

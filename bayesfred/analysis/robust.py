@@ -18,9 +18,10 @@ the gradient as they stay, and I_s that of the pixels' derivatives as they stay 
 follow. Where positions scatter, the shifts' own width pulls on theta against u_s: that is left out,
 and the errors of a true model come out 1.07 times the plain ones of 196 sources, 1.19 times of 25.
 
-The errors of a measured PSF are in the covariance, but in no source's u_s: H is then that of a
-known PSF. In units of R the sandwich tells how much farther the maximum scatters than it should.
-The covariance R' R'^T with the PSF's errors becomes that many times larger: R' is put in R's place.
+Errors that are added, such as those of a measured PSF, are in the covariance, but in no source's
+u_s: H is then without them. In units of R the sandwich tells how much farther the maximum scatters
+than it should. The covariance R' R'^T with them becomes that many times larger: R' is put in R's
+place.
 
 It holds for errors that are independent from source to source. It does not know of those that all
 share, such as a PSF that is too wide: these displace theta and leave no scatter. Of few sources it
@@ -63,7 +64,7 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     params : ndarray, shape (d,)
         The MAP.
     covariance : ndarray, shape (d, d)
-        Inverse of information and prior curvature there, with the errors of a measured PSF.
+        Inverse of information and prior curvature there, with the errors that are added.
 
     Returns
     -------
@@ -82,8 +83,8 @@ def robust_sd(posterior: Posterior, params: Floats, covariance: Floats) -> Float
     level = float(params[posterior.parameter_names.index("background")])
     residual = (posterior.counts - fits.expected).ravel()[order]
     weight = 1.0 / posterior.noise_at(params).counts_variance(fits.expected, level).ravel()[order]
-    measured = posterior.psf_errors is not None
-    known = inverse(posterior.information(params)) if measured else covariance
+    added = posterior.added_covariance is not None
+    known = inverse(posterior.information(params)) if added else covariance
     root = np.linalg.cholesky(known)  # units in which this covariance is 1
     # as the information takes it: the average curvature of the shifts' prior
     expected = replace(fits, scatter=fits.scatter / EXPECTED)

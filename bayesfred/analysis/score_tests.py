@@ -22,7 +22,8 @@ I_phi,theta C P (theta* - m): both vanish with P, so that with a prior which is 
 counts z = S / sqrt(Var S) is a normal number for any truth. Free fluxes and shifts of sources are
 profiled out of gradient and information already. A parameter at a bound of its prior is taken as
 fixed. S / Var S is the step of Fisher's scoring, an estimate of phi less its value in the model, of
-variance 1 / Var S.
+variance 1 / Var S. Displacements that neighbouring sources have in common, where they are in the
+errors, move U: what they add to the variance of S is added, and the step remains what it is.
 
 What is tested: the PSF's width, the pointing, a common factor of the fluxes, a slope and a
 curvature of the background, and every term x^i y^j that the distortion lacks, up to two degrees
@@ -50,6 +51,8 @@ from scipy import special
 
 from bayesfred._typing import Flags, Floats
 from bayesfred.analysis.checks import Check, largest_deviate, not_tested
+from bayesfred.analysis.random_field import placed, shared_products
+from bayesfred.analysis.sources import SourceFits, fit_sources
 from bayesfred.errors import InputError
 from bayesfred.imaging.distortion import PolynomialDistortion
 from bayesfred.imaging.monomials import Exponents, degree_of, term_name
@@ -85,17 +88,26 @@ class ScoreTests:
         What the model has for them.
     score : ndarray, shape (k,)
         Derivative of the log-likelihood, what the fitted parameters absorb taken off.
-    covariance : ndarray, shape (k, k)
-        Of the scores, if the model is true.
+    information : ndarray, shape (k, k)
+        About these numbers, what the fitted parameters absorb taken off.
     tested : ndarray of bool, shape (k,)
         Whether the fitted parameters leave enough of it.
+    shared : ndarray, shape (k, k), or None
+        What displacements in common add to the covariance of the scores, which otherwise is the
+        information; None where there are none.
     """
 
     names: tuple[str, ...]
     values: Floats
     score: Floats
-    covariance: Floats
+    information: Floats
     tested: Flags
+    shared: Floats | None = None
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the scores, if the model is true, shape (k, k)."""
+        return self.information if self.shared is None else self.information + self.shared
 
     @property
     def z(self) -> Floats:
@@ -122,19 +134,20 @@ class ScoreTests:
     def leading(self) -> tuple[Lead, ...]:
         """What is wrong, the number first that explains most; empty where nothing is."""
         found: list[Lead] = []
-        score, covariance = self.score.copy(), self.covariance.copy()
-        full, left = np.diag(covariance).copy(), np.array(self.tested, dtype=bool)
+        score, information, covariance = self.score.copy(), self.information, self.covariance
+        full, left = np.diag(information), np.array(self.tested, dtype=bool)
         while left.any():
             z = np.where(left, score / np.sqrt(np.where(left, np.diag(covariance), 1.0)), 0.0)
             best = int(np.argmax(np.where(np.abs(z) > self.limits, np.abs(z), 0.0)))
             if not abs(z[best]) > self.limits[best]:
                 break
-            step = score[best] / covariance[best, best]
+            step = score[best] / information[best, best]
             found.append(Lead(self.names[best], float(z[best]), float(self.values[best]), step))
-            column = covariance[:, best].copy()
-            score -= column * step
-            covariance -= np.outer(column, column) / column[best]
-            left &= np.diag(covariance) > LEAST * full
+            freed = np.eye(score.size)  # scores once it is fitted
+            freed[:, best] -= information[:, best] / information[best, best]
+            score, information = freed @ score, freed @ information @ freed.T
+            covariance = freed @ covariance @ freed.T
+            left &= np.diag(information) > LEAST * full
         return tuple(found)
 
     def joint(self, starts: tuple[str, ...]) -> tuple[float, int]:
@@ -168,11 +181,12 @@ class ScoreTests:
     def _row(self, name: str, k: int, z: float, meaning: str) -> Check:
         if not self.tested[k]:
             return not_tested(name, "the fitted parameters stand in for it")
-        variance = self.covariance[k, k]
-        return Check(name, self.score[k] / variance, 0.0, variance**-0.5, z, meaning)
+        told = self.information[k, k]
+        sd = self.covariance[k, k] ** 0.5 / told
+        return Check(name, self.score[k] / told, 0.0, sd, z, meaning)
 
 
-def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
+def score_tests(posterior: Posterior, params: Floats, fits: SourceFits | None = None) -> ScoreTests:
     """Test every number that the model of a frame could fit and does not.
 
     Parameters
@@ -180,6 +194,8 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
     posterior : Posterior
     params : ndarray, shape (d,)
         The MAP.
+    fits : SourceFits, optional
+        Of the sources there, where they are at hand.
 
     Returns
     -------
@@ -235,13 +251,20 @@ def score_tests(posterior: Posterior, params: Floats) -> ScoreTests:
     covariance = left - cross.T @ taken
     # the maximum is found up to a small gradient
     score = score[others] * scale[others] - taken.T @ ((score[fitted] + pull) * scale[fitted])
-    size = 1.0 / scale[others]
+    size, shared = 1.0 / scale[others], None
+    if posterior.displacement_errors is not None and posterior.displacement_errors.field:
+        fits = fits or fit_sources(posterior, params)
+        found = placed(posterior, params, fits, (likelihood, values))
+        moves = found.pulls
+        moves = moves[..., others] - (moves[..., fitted] * scale[fitted]) @ taken * size
+        shared = shared_products(posterior.displacement_errors.field, found, moves)
     return ScoreTests(
         tuple(names[k] for k in others),
         values[others],
         score * size,
         covariance * np.outer(size, size),
         np.diag(covariance) > LEAST * np.diag(left),
+        shared,
     )
 
 

@@ -105,7 +105,7 @@ def read_frames(
     alone: list[MapEstimate | None] = []
     doubts: list[str] = []
     psfs: dict[str, PSF] = {}  # frames with the PSF of one file have its errors in common
-    notes: list[str] = []
+    notes, lines = list[str](), list[str]()
     for own in run.frames.values():
         if repr(own.psf) not in psfs:
             psfs[repr(own.psf)] = build.reference_psf(own, run_file)
@@ -118,9 +118,9 @@ def read_frames(
             read = pipeline.read_doubted(own, run_file, told, psf=psf)
         except InputError as error:
             raise InputError(f"{error} (frame {name})") from None
-        frames[name], estimate, lines, why = read
+        frames[name], estimate, said, why = read
         alone.append(estimate)
-        notes += [f"{name}: {line}" for line in lines]
+        notes += [f"{name}: {line}" for line in said]
         doubts += [f"{name}: {'; '.join(why)}"] if why else []
     with naming(run_file), working(show=say is not None):
         joint = _joint(run, frames)
@@ -128,9 +128,15 @@ def read_frames(
         if any(isinstance(frame.model.psf, MeasuredPSF) for frame in frames.values()):
             start = find_map(joint, start).params
             joint = marginalize_joint_psf(joint, start)
-        if start is not None or doubts:
+        scatters = any(frame.nuisances.position_scatter for frame in frames.values())
+        if start is not None or doubts or scatters:
             found = find_map(joint, start)
-    return joint, found and pipeline.doubted(found, _named(doubts)), _kept(notes)
+        if scatters and found is not None:
+            joint, found, lines = pipeline.with_displacements(joint, found)
+    if say:
+        for line in lines:
+            say(line)
+    return joint, found and pipeline.doubted(found, _named(doubts)), _kept([*notes, *lines])
 
 
 def _named(doubts: Sequence[str]) -> list[str]:

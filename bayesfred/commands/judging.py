@@ -87,7 +87,7 @@ def study(
         build.simulation(run, run_file)
     truth: Floats | None = None
     if simulation is None:
-        posterior, _, _ = pipeline.read_frame(run, run_file, say)
+        posterior = pipeline.read_doubted(run, run_file, say)[0]
     else:
         posterior, truth = build.simulated(run, run_file, simulation.seed)
     if s.path is None:

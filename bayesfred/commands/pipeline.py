@@ -14,6 +14,11 @@ from bayesfred import build, settings
 from bayesfred._typing import Floats
 from bayesfred.analysis.causes import find_causes
 from bayesfred.analysis.choose_terms import choose_terms
+from bayesfred.analysis.displacements import (
+    SomePosterior,
+    displacement_lines,
+    marginalize_displacements,
+)
 from bayesfred.analysis.failed_sources import leave_out_failed
 from bayesfred.build import naming
 from bayesfred.commands.records import Result
@@ -40,7 +45,7 @@ from bayesfred.optimize.uncatalogued import find_uncatalogued
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
 
-__all__ = ["doubted", "fit_frame", "read_doubted", "read_frame"]
+__all__ = ["doubted", "fit_frame", "read_doubted", "read_frame", "with_displacements"]
 
 DARKEST = 1e-3  # counts per pixel of a background to begin with
 ANOTHER = 2.0  # times the frame's own width: a start that is farther off is not used
@@ -64,8 +69,8 @@ def read_frame(
     -------
     posterior : Posterior
     estimate : MapEstimate or None
-        Its maximum, if outliers were rejected or terms chosen, or where there are doubts: then the
-        model does not fit, and the message says why.
+        Its maximum, if outliers were rejected or terms chosen, positions scatter, or where there
+        are doubts: then the model does not fit, and the message says why.
     notes : list of str
         What was read, what was removed, and what was chosen.
 
@@ -75,10 +80,46 @@ def read_frame(
         If frame, catalogue or settings are unusable.
     """
     posterior, estimate, notes, doubts = read_doubted(run, run_file, say, psf=psf)
-    if doubts and estimate is None:
-        with naming(run_file), working(show=say is not None):
+    lines, scatters = list[str](), posterior.nuisances.position_scatter
+    with naming(run_file), working(show=say is not None):
+        if estimate is None and (doubts or scatters):
             estimate = find_map(posterior)
-    return posterior, estimate and doubted(estimate, doubts), notes
+        if scatters and estimate is not None:
+            posterior, estimate, lines = with_displacements(posterior, estimate)
+    if say:
+        for line in lines:
+            say(line)
+    return posterior, estimate and doubted(estimate, doubts), [*notes, *lines]
+
+
+def with_displacements(
+    posterior: SomePosterior, estimate: MapEstimate
+) -> tuple[SomePosterior, MapEstimate, list[str]]:
+    """Put displacements that neighbouring sources have in common into the errors.
+
+    Parameters
+    ----------
+    posterior : Posterior or JointPosterior
+        With positions that scatter.
+    estimate : MapEstimate
+        Its maximum.
+
+    Returns
+    -------
+    posterior : Posterior or JointPosterior
+    estimate : MapEstimate
+        The same, with the wider errors.
+    lines : list of str
+        What is said of that; none where there are no such displacements.
+    """
+    if not estimate.at_maximum:
+        return posterior, estimate, []
+    widened = marginalize_displacements(posterior, estimate)
+    errors = widened.displacement_errors
+    if errors is None:
+        return widened, estimate, []
+    lines = displacement_lines(widened, estimate.covariance)
+    return widened, replace(estimate, covariance=estimate.covariance + errors.covariance), lines
 
 
 def doubted(estimate: MapEstimate, doubts: Sequence[str]) -> MapEstimate:

@@ -22,10 +22,10 @@ from bayesfred.errors import InputError
 
 KIND = b"bayesfred chain"
 CALIBRATION = b"bayesfred calibration"
-SCHEMA = 9
+SCHEMA = 10
 READABLE = {  # schemas by kind; not all that a chain may hold, see `sampling/chainfile`
-    KIND: (3, 4, 5, 6, 7, 8, 9),
-    CALIBRATION: (7, 8, 9),
+    KIND: (3, 4, 5, 6, 7, 8, 9, 10),
+    CALIBRATION: (7, 8, 9, 10),
 }
 COMMANDS = {KIND: "fit", CALIBRATION: "calibration"}  # which write them
 SEAL = "\nbayesfred sha256 {}\n"

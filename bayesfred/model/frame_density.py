@@ -12,7 +12,9 @@ import numpy.typing as npt
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.model import priors
+from bayesfred.model.displacement_errors import DisplacementErrors
 from bayesfred.model.protocol import TargetDensity
+from bayesfred.model.psf_errors import PsfErrors
 
 
 class FrameDensity(TargetDensity):
@@ -22,6 +24,15 @@ class FrameDensity(TargetDensity):
     """
 
     prior: Mapping[str, Any]
+    psf_errors: PsfErrors | None
+    displacement_errors: DisplacementErrors | None
+
+    @property
+    def added_covariance(self) -> Floats | None:
+        """What errors that `log_prob` has not add to the parameters' covariance, shape (d, d)."""
+        both = (self.psf_errors, self.displacement_errors)
+        added = [errors.covariance for errors in both if errors is not None]
+        return np.asarray(sum(added)) if added else None
 
     @property
     def n_parameters(self) -> int:
@@ -69,7 +80,7 @@ class FrameDensity(TargetDensity):
     def information(self, params: npt.ArrayLike) -> Floats:
         """Fisher information plus prior curvature, shape (d, d).
 
-        The inverse is the covariance of the Laplace approximation with the PSF fixed.
+        The inverse is the covariance of the Laplace approximation without `added_covariance`.
         """
         return np.asarray(self.fisher(params) + self.prior_information(params))
 

@@ -22,6 +22,7 @@ from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
+from bayesfred.model.displacement_errors import DisplacementErrors
 from bayesfred.model.drift import Drift, DriftColumn
 from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.frame_evaluator import FrameEvaluator, LocalFrames
@@ -57,6 +58,8 @@ class JointPosterior(FrameDensity):
         Shared terms that change with time.
     psf_errors : PsfErrors, optional
         What the errors of the frames' measured PSFs add: see `optimize.joint_map`.
+    displacement_errors : DisplacementErrors, optional
+        What displacements that neighbouring sources of a frame have in common add.
     evaluator : FrameEvaluator, optional
         Where the frames are evaluated; by default in this process.
 
@@ -87,6 +90,7 @@ class JointPosterior(FrameDensity):
     prior: Mapping[str, Any]
     drift: Drift | None
     psf_errors: PsfErrors | None
+    displacement_errors: DisplacementErrors | None = field(metadata={"since": 10})
     evaluator: FrameEvaluator = field(metadata={"stored": False})
 
     def __init__(
@@ -97,6 +101,7 @@ class JointPosterior(FrameDensity):
         prior: Mapping[str, Any] | None = None,
         drift: Drift | None = None,
         psf_errors: PsfErrors | None = None,
+        displacement_errors: DisplacementErrors | None = None,
         evaluator: FrameEvaluator | None = None,
     ) -> None:
         require_names(frames)
@@ -104,10 +109,11 @@ class JointPosterior(FrameDensity):
         common = lens_terms(first) if shared is None else tuple(dict.fromkeys(shared))
         given = agreed_priors(frames, common, prior or {})
         where = evaluator or LocalFrames(frames)
-        self._set_fields(frames, common, {}, drift, psf_errors, where)
+        self._set_fields(frames, common, {}, drift, psf_errors, displacement_errors, where)
         object.__setattr__(self, "prior", priors.with_defaults(given, self.parameters))
-        if psf_errors is not None:
-            psf_errors.require_names(self.parameter_names)
+        for errors in (psf_errors, displacement_errors):
+            if errors is not None:
+                errors.require_names(self.parameter_names)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -173,7 +179,7 @@ class JointPosterior(FrameDensity):
         return self.parts[list(self.frames).index(name)]
 
     def frame(self, name: str) -> Posterior:
-        """The posterior of a frame, with the priors and the errors of PSFs that it has here.
+        """The posterior of a frame, with the priors and the added errors that it has here.
 
         Parameters
         ----------
@@ -195,7 +201,12 @@ class JointPosterior(FrameDensity):
             covariance = self.frame_covariance(name, self.psf_errors.covariance)
             own = (errors.absorbed, errors.occam) if errors else ()
             errors = PsfErrors(frame.parameter_names, covariance, *own)
-        return replace(frame, prior=prior, psf_errors=errors)
+        moved = frame.displacement_errors
+        if self.displacement_errors is not None:
+            covariance = self.frame_covariance(name, self.displacement_errors.covariance)
+            field = moved.field if moved else None
+            moved = DisplacementErrors(frame.parameter_names, covariance, *(field or ()))
+        return replace(frame, prior=prior, psf_errors=errors, displacement_errors=moved)
 
     def frame_params(self, name: str, params: npt.ArrayLike) -> Floats:
         """The parameters of a frame's own posterior.

@@ -19,6 +19,7 @@ from bayesfred.imaging.psf import PSF, has_pixel
 from bayesfred.io.arrays import frame_given
 from bayesfred.io.serialize import serializable
 from bayesfred.model import priors
+from bayesfred.model.displacement_errors import DisplacementErrors
 from bayesfred.model.extrapolation import Extrapolation
 from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.likelihood import FrameLikelihood
@@ -59,6 +60,9 @@ class Posterior(FrameDensity):
         What the errors of a measured PSF add to the parameters': `marginalize_psf` finds it.
         `log_prob` is that with the PSF fixed, but for its volume's word on the model error;
         `MapEstimate.covariance` and `Chain.draws` have them.
+    displacement_errors : DisplacementErrors, optional
+        What displacements that neighbouring sources have in common add: `marginalize_displacements`
+        finds it. They are as little in `log_prob`.
 
     Attributes
     ----------
@@ -72,8 +76,8 @@ class Posterior(FrameDensity):
     InputError
         If the frame does not fit the detector, is in another unit or has other uncertainties, holds
         values that no noise model explains, every pixel is masked, no source lies in the frame, or
-        a prior is unusable; if the extrapolation is of another model, or the errors of a PSF
-        of other parameters.
+        a prior is unusable; if the extrapolation is of another model, or added errors are of
+        other parameters.
 
     Examples
     --------
@@ -95,6 +99,7 @@ class Posterior(FrameDensity):
     extrapolation: Extrapolation | Around | None = field(metadata={"stored": False})
     valid: Flags = field(metadata={"since": 9})
     psf_errors: PsfErrors | None = field(metadata={"since": 6})
+    displacement_errors: DisplacementErrors | None = field(metadata={"since": 10})
 
     def __init__(
         self,
@@ -108,6 +113,7 @@ class Posterior(FrameDensity):
         extrapolation: Extrapolation | Around | None = None,
         valid: npt.ArrayLike | None = None,
         psf_errors: PsfErrors | None = None,
+        displacement_errors: DisplacementErrors | None = None,
     ) -> None:
         frame, mask = frame_given(counts, mask, getattr(noise, "variance", None))
         used = usable_pixels(model, frame, mask, noise, nuisances)
@@ -123,11 +129,12 @@ class Posterior(FrameDensity):
             frame = np.where(finite, frame, 0.0)
         self._set_fields(
             model, frame, {}, noise, used, nuisances,
-            extrapolation, valid, psf_errors,
+            extrapolation, valid, psf_errors, displacement_errors,
         )  # fmt: skip
         object.__setattr__(self, "prior", priors.with_defaults(prior or {}, self.parameters))
-        if psf_errors is not None:
-            psf_errors.require_names(self.parameter_names)
+        for errors in (psf_errors, displacement_errors):
+            if errors is not None:
+                errors.require_names(self.parameter_names)
         if isinstance(extrapolation, Around) and extrapolation.params.size != self.n_parameters:
             raise InputError(
                 f"extrapolation: got one about {extrapolation.params.size} parameters, expected "
@@ -246,7 +253,7 @@ class Posterior(FrameDensity):
         return found
 
     def with_psf(self, psf: PSF) -> "Posterior":
-        """The same posterior with another PSF, and without what errors of a PSF took from it.
+        """The same posterior with another PSF, and without errors that are added.
 
         A PSF that has the pixel's response in it is sampled at the pixels' centres, and its width
         is no parameter.
@@ -266,8 +273,9 @@ class Posterior(FrameDensity):
             prior.pop("psf_sigma", None)
         model = replace(self.model, psf=psf, detector=detector)
         return replace(
-            self, model=model, prior=prior, nuisances=nuisances, extrapolation=None, psf_errors=None
-        )
+            self, model=model, prior=prior, nuisances=nuisances, extrapolation=None,
+            psf_errors=None, displacement_errors=None,
+        )  # fmt: skip
 
     def simulate(
         self,

@@ -1,21 +1,13 @@
 """What the errors of a measured PSF add to those of the parameters.
 
-With the PSF fixed at its estimate the parameters theta have a posterior of information I. Had the
-PSF been another one, drawn from its own posterior, theta would have come out elsewhere, by I^-1
-times the gradient that the other PSF gives at the old maximum. These displacements have the
-covariance
-
-    W = I^-1 G I^-1,
-
-G that of the gradients. With the PSF integrated out the posterior of theta is the one with the PSF
-fixed, convolved with a normal distribution of covariance W: to every draw from the one a draw of
-the other is added. For a PSF that was measured on the same frame the information that remains, the
-inverse of I^-1 + W, is Schur's complement of the joint information of parameters and PSF
-(Woodbury's identity).
+The posterior has the PSF fixed at its estimate. Had it been another one, drawn from its own
+posterior, the parameters would have come out elsewhere: `added_errors` says by how much, with G the
+covariance of the gradients that such PSFs give at the old maximum. For a PSF that was measured on
+the same frame the information that remains, the inverse of I^-1 + W, is Schur's complement of the
+joint information of parameters and PSF (Woodbury's identity).
 
 W hardly depends on how much positions or light scatter about the model, unlike the information that
-is lost: the scatter widens what every source says, the PSF moves all of them together. Parameters
-that are such scales are left as they are.
+is lost: the scatter widens what every source says, the PSF moves all of them together.
 
 A model error is another matter. The PSF's numbers fit what the model lacks on their own stars, so
 the residuals are too small for it. With the PSF integrated out, its likelihood is multiplied by the
@@ -24,19 +16,17 @@ volume of the PSF's posterior, which grows as the model error takes information 
 """
 
 from dataclasses import dataclass, field
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
-from scipy import linalg
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
 from bayesfred.imaging.psf import PSF, MeasuredPSF, PSFToMeasure
 from bayesfred.io.serialize import serializable
-from bayesfred.model.parameters import SCALES
+from bayesfred.model.added_errors import AddedErrors, moved_by
 
 MOST_LOST = 0.9  # of the information about the model error
-STREAM = 0x507F  # of random numbers, beside those of a run's steps
 
 
 def covariance_of(slopes: Floats) -> Floats:
@@ -129,7 +119,7 @@ class OccamFactor:
 
 @serializable("psf_errors")
 @dataclass(frozen=True, eq=False)
-class PsfErrors:
+class PsfErrors(AddedErrors):
     """The covariance that the errors of a PSF add to that of the parameters.
 
     Attributes
@@ -150,28 +140,14 @@ class PsfErrors:
 
     Examples
     --------
-    >>> errors = PsfErrors(("f_x",), np.array([[4.0]]))
-    >>> bool(abs(errors.displacements(10_000, 1).std() - 2.0) < 0.1)
-    True
+    >>> PsfErrors(("f_x",), np.array([[4.0]])).absorbed
+    0.0
     """
 
-    names: tuple[str, ...]
-    covariance: Floats
     absorbed: float = 0.0
     occam: OccamFactor | None = field(default=None, metadata={"since": 8})
 
-    def __post_init__(self) -> None:
-        d = len(self.names)
-        if self.covariance.shape != (d, d):
-            raise InputError(f"psf_errors: got shape {self.covariance.shape}, expected ({d}, {d})")
-
-    def require_names(self, names: tuple[str, ...]) -> None:
-        """Refuse errors of other parameters than these."""
-        if self.names != names:
-            raise InputError(
-                f"psf_errors: got those of {', '.join(self.names)}, expected those of "
-                f"{', '.join(names)}"
-            )
+    label: ClassVar[str] = "psf_errors"
 
     @classmethod
     def of(
@@ -198,23 +174,4 @@ class PsfErrors:
         -------
         PsfErrors
         """
-        moved = np.flatnonzero([name not in SCALES for name in names])
-        block = information[np.ix_(moved, moved)]
-        scale = 1.0 / np.sqrt(np.diag(block))
-        factor = linalg.cho_factor(block * np.outer(scale, scale))
-        half = scale[:, None] * linalg.cho_solve(factor, np.diag(scale))
-        covariance = np.zeros_like(information)
-        covariance[np.ix_(moved, moved)] = half @ slopes[np.ix_(moved, moved)] @ half.T
-        return cls(names, covariance, absorbed, occam)
-
-    def displacements(self, n: int, seed: int) -> Floats:
-        """Draws of what another PSF would add to the parameters, shape (n, d).
-
-        The same number and seed give the same draws.
-        """
-        scale = np.sqrt(np.diag(self.covariance))
-        scale[scale == 0.0] = 1.0
-        variances, axes = linalg.eigh(self.covariance / np.outer(scale, scale))
-        half = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
-        random = np.random.default_rng([STREAM, seed])
-        return np.asarray(random.standard_normal((n, len(half))) @ half.T)
+        return cls(names, moved_by(names, information, slopes), absorbed, occam)

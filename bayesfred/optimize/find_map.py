@@ -337,8 +337,8 @@ def _estimate(
         message = f"not found, {message}: {remedy}"
     else:
         message = f"found, {message}{advice and f'; {advice}'}"
-    errors = getattr(posterior, "psf_errors", None)
-    covariance = top.covariance if errors is None else top.covariance + errors.covariance
+    added = getattr(posterior, "added_covariance", None)
+    covariance = top.covariance if added is None else top.covariance + added
     return MapEstimate(top.params, covariance, top.log_prob, evaluations, message, at_maximum, fits)
 
 

@@ -77,9 +77,9 @@ def approximations(
     modes, parts = estimate.mixture, []
     for k, weight in enumerate(modes.weights):
         mean, covariance = modes.means[k], modes.covariances[k]
-        errors = getattr(posterior, "psf_errors", None)
-        if errors is not None and estimate.modes is None:  # which log_prob has not
-            covariance = covariance - errors.covariance
+        added = getattr(posterior, "added_covariance", None)
+        if added is not None and estimate.modes is None:  # which log_prob has not
+            covariance = covariance - added
         scales, (low, high) = [], posterior.support
         outside = np.any((mean <= low) | (mean >= high))  # where the paraboloid's top is
         if k < modes.count and (posterior.hyperparameters or not outside):

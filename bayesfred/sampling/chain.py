@@ -15,6 +15,7 @@ import xarray as xr
 from bayesfred._typing import Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.io.summary_table import Table
+from bayesfred.model.added_errors import added_draws
 from bayesfred.model.joint import JointPosterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate
@@ -170,13 +171,13 @@ class Chain:
     def draws(self) -> Floats:
         """All draws after burn-in, shape (n, d), parameter units.
 
-        Where the PSF was measured its errors are in them: those of the sampler have the PSF fixed.
+        Errors that the posterior adds, such as those of a measured PSF, are in them.
         """
         kept = self.chain[:, self.burn_in :].reshape(-1, len(self.parameter_names))
-        errors = getattr(self.density, "psf_errors", None)
-        if errors is None:
+        added = getattr(self.density, "added_covariance", None)
+        if added is None:
             return kept
-        moved = kept + errors.displacements(len(kept), self.seed)
+        moved = kept + added_draws(added, len(kept), self.seed)
         return np.asarray(np.clip(moved, *self.density.support))
 
     def summary(self) -> Table:

@@ -123,9 +123,9 @@ class FrameMove(Move):  # type: ignore[misc]
     @classmethod
     def of(cls, posterior: JointPosterior, estimate: MapEstimate, log_parts: Parts) -> "FrameMove":
         """The move for a joint posterior, given its maximum."""
-        covariance, errors = estimate.covariance, posterior.psf_errors
-        if errors is not None:  # which log_prob has not
-            covariance = covariance - errors.covariance
+        covariance, added = estimate.covariance, posterior.added_covariance
+        if added is not None:  # which log_prob has not
+            covariance = covariance - added
         mean, (low, high) = estimate.params, posterior.support
         if np.any((mean <= low) | (mean >= high)):  # the paraboloid's top is outside
             mean = mean + covariance @ posterior.gradient(mean)

@@ -185,7 +185,8 @@ def displaced_alike(found: Neighbours) -> Cause:
         "is finer than the distortion's terms and not independent from source to source, such as "
         "ghosts or the target's own errors: errors of the coefficients are some "
         f"{found.factor:.2g} times these",
-        "add terms to the distortion, or take its errors for so much larger",
+        "add terms to the distortion, or set nuisances.position_scatter = true, by which a fit has "
+        "such displacements in its errors",
     )  # fmt: skip
 
 
