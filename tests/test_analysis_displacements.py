@@ -25,9 +25,11 @@ from bayesfred.analysis.random_field import (
 from bayesfred.analysis.residuals import judge_residuals
 from bayesfred.analysis.score_tests import ScoreTests, score_tests
 from bayesfred.analysis.sources import fit_sources
+from bayesfred.analysis.verdict import judge_fit
 from bayesfred.commands.pipeline import with_displacements
 from bayesfred.model.displacement_errors import DisplacementErrors, RandomField
 from bayesfred.model.kernels.fisher import EXPECTED
+from bayesfred.optimize.fit_statistics import fit_statistics
 
 Floats = NDArray[np.float64]
 
@@ -293,6 +295,12 @@ def test_the_checks_know_of_the_field(widened: Widened) -> None:
     alone = bf.cross_check(posterior, estimate=best)
     assert alone.verdict == "too small" and "which both halves have in common" in alone.message
     assert bf.cross_check(other, estimate=wider).verdict == "right"
+    said = "Neighbouring sources are displaced alike, by 0.0"
+    for each, residuals in ((posterior, before), (other, after)):
+        fit = fit_statistics(each, best.params)
+        verdict = judge_fit(each, best, fit, residuals)
+        assert verdict.fits_data == (each is other)
+        assert (said in verdict.sentence) == (each is other)
 
 
 def test_scores_of_missing_terms_have_the_fields_variance(widened: Widened) -> None:

@@ -130,7 +130,7 @@ def judge_fit(
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
-    sentence += _far_off(residuals)
+    sentence += _far_off(residuals) + _in_common(posterior)
     omitted = _omitted(posterior, fit, fits) + _unexplained(posterior, params)
     return FitVerdict(fits, causes, sentence, omitted, unmatched)
 
@@ -296,6 +296,17 @@ def _far_off(residuals: Residuals | None) -> str:
     return (
         f" {len(far)} of {len(table)} sources lie far off the catalogue and hardly count: "
         f"{', '.join(named)}{more}."
+    )
+
+
+def _in_common(posterior: Any) -> str:
+    """The displacements that neighbouring sources have in common, where errors have them."""
+    errors = getattr(posterior, "displacement_errors", None)
+    if errors is None or errors.field is None:
+        return ""
+    return (
+        f" Neighbouring sources are displaced alike, by {errors.sd:.2g} px over "
+        f"{errors.length:.2g} px, which the errors have in them."
     )
 
 

@@ -57,7 +57,8 @@ class Nuisances:
         Whether the sources lie off their catalogue positions: parameter `position_scatter`, pixel,
         as imaged, the scale of Student's t distribution with 3 degrees of freedom, whose heavy
         tails hold sources that are far off. Needs free fluxes. Like these, the shifts are not
-        sampled.
+        sampled. Sources scatter independently; see `marginalize_displacements` for neighbours that
+        are displaced alike.
     flux_shape : float
         Shape of the free fluxes' Gamma prior, at least 1, which has the relative standard deviation
         1/sqrt(flux_shape): 2, the default, says little, 25 that the catalogue's fluxes are right to
