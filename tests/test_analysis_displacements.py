@@ -14,7 +14,7 @@ from test_sampling_chain import reseal
 
 import bayesfred as bf
 from bayesfred.analysis import random_field
-from bayesfred.analysis.displacements import displacement_lines
+from bayesfred.analysis.displacements import displacement_lines, widening
 from bayesfred.analysis.random_field import (
     FieldLeft,
     Placed,
@@ -369,3 +369,18 @@ def test_frames_have_fields_of_their_own() -> None:
     part = chain.frame("a")
     assert part.posterior().displacement_errors.field == one.field
     assert bf.diagnose(chain).frames["a"].residuals.neighbours.expected > 0.0
+
+
+def test_a_field_makes_no_errors_smaller(widened: Widened) -> None:
+    """Directions along which displacements would cancel keep their errors, the others theirs."""
+    posterior, best, _, _ = widened
+    moved = [k for k, name in enumerate(posterior.parameter_names) if name != "position_scatter"]
+    block = np.ix_(moved, moved)
+    information = posterior.information(best.params)
+    lower = np.linalg.cholesky(information[block])
+    axes = np.linalg.qr(np.random.default_rng(956).standard_normal(lower.shape))[0]
+    values, slopes = np.linspace(-0.5, 2.0, len(axes)), np.zeros_like(information)
+    slopes[block] = lower @ (axes * values) @ axes.T @ lower.T
+    added = widening(posterior, best.params, slopes)[block]
+    found = np.linalg.eigvalsh(lower.T @ added @ lower)
+    assert found == pytest.approx(np.maximum(values, 0.0), abs=0.02)

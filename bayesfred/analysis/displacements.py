@@ -161,7 +161,10 @@ def _of_frame(posterior: Posterior, params: Floats) -> tuple[DisplacementErrors,
     if field is None:
         return None
     slopes = shared_products(field, sources, sources.pulls)
-    covariance = _widening(posterior, params, slopes)
+    try:
+        covariance = widening(posterior, params, slopes)
+    except linalg.LinAlgError:  # one of several frames, which tells of its parameters with others
+        covariance = np.zeros_like(slopes)
     return DisplacementErrors(posterior.parameter_names, covariance, *field), slopes
 
 
@@ -175,13 +178,26 @@ def _of_frames(joint: JointPosterior, params: Floats) -> JointPosterior:
             total += view.to_frame.T @ found[1] @ view.to_frame
     if not total.any():
         return joint
-    errors = DisplacementErrors(joint.parameter_names, _widening(joint, params, total))
+    errors = DisplacementErrors(joint.parameter_names, widening(joint, params, total))
     widened = with_frames(joint, frames)
     return replace(widened, psf_errors=joint.psf_errors, displacement_errors=errors)
 
 
-def _widening(posterior: Posterior | JointPosterior, params: Floats, slopes: Floats) -> Floats:
-    """The covariance that slopes of this covariance add, without what would make errors smaller."""
+def widening(posterior: Posterior | JointPosterior, params: Floats, slopes: Floats) -> Floats:
+    """What slopes of the log-posterior add to the parameters' covariance, and nowhere take from it.
+
+    Parameters
+    ----------
+    posterior : Posterior or JointPosterior
+    params : ndarray, shape (d,)
+        Its maximum.
+    slopes : ndarray, shape (d, d)
+        What is added to the covariance of the gradient there.
+
+    Returns
+    -------
+    ndarray, shape (d, d)
+    """
     information = posterior.information(params)
     scale = 1.0 / np.sqrt(np.diag(information))
     values, vectors = linalg.eigh(

@@ -43,7 +43,8 @@ from bayesfred.model.posterior import Posterior
 __all__ = ["FieldLeft", "Placed", "find_field", "placed", "shared_products"]
 
 BLOCK = 250  # sources at most
-MOST = 12  # blocks
+MOST = 8  # blocks
+EVALUATIONS = 150  # of the likelihood at most: a field that is there needs fewer
 REACH = 6.0  # lengths, beyond which the field is not followed
 ROWS = 1000  # sources whose pairs are made at a time
 TOLD = 1e-8  # of the largest singular value, below which coefficients are not told apart
@@ -135,7 +136,7 @@ def find_field(sources: Placed) -> RandomField | None:
         step = distance_of_neighbours(sources.images) if len(sources.images) >= FEWEST else 0.0
     except spatial.QhullError:  # on a line
         return None
-    if not step > 0.0:
+    if not (step > 0.0 and np.any(sources.found)):
         return None
     variance = np.diagonal(sources.errors, axis1=1, axis2=2)
     bound = OUTLYING / np.sqrt(np.diagonal(sources.precision, axis1=1, axis2=2))
@@ -176,7 +177,8 @@ def find_field(sources: Placed) -> RandomField | None:
     high = np.array([largest + 1.0, np.log(FOLLOWED * step), largest])
     best = optimize.minimize(
         minus_log_likelihood, np.log([0.7 * size, 1.5 * step, 0.7 * size]), method="Nelder-Mead",
-        bounds=optimize.Bounds(low, high), options={"xatol": CLOSE, "fatol": CLOSE},
+        bounds=optimize.Bounds(low, high),
+        options={"xatol": CLOSE, "fatol": CLOSE, "maxfev": EVALUATIONS},
     )  # fmt: skip
     if not 2.0 * (alone.fun - best.fun) > AKAIKE:
         return None
