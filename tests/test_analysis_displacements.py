@@ -90,8 +90,8 @@ def test_the_field_is_found() -> None:
         design = sources.slopes[:, 0, :4]
         left = [y - design @ np.linalg.lstsq(design, y)[0] for y in values]
         sources = sources._replace(found=np.column_stack(left))
-        field = find_field(sources)
-        blind = find_field(sources._replace(slopes=sources.slopes[:, :, :0]))
+        field = find_field(sources, sources.slopes)
+        blind = find_field(sources, sources.slopes[:, :, :0])
         assert field is not None and blind is not None
         logs.append(np.log(np.divide(field, true)))
         without.append(np.log(np.divide(blind, true)))
@@ -103,9 +103,9 @@ def test_the_field_is_found() -> None:
 def test_blocks_tell_what_all_sources_together_tell(monkeypatch: pytest.MonkeyPatch) -> None:
     rng, true = np.random.default_rng(951), RandomField(0.03, 20.0, 0.01)
     sources = made_up(700, true, rng)
-    blocks = find_field(sources)
+    blocks = find_field(sources, sources.slopes)
     monkeypatch.setattr(random_field, "BLOCK", 700)
-    whole = find_field(sources)
+    whole = find_field(sources, sources.slopes)
     assert blocks is not None and whole is not None
     assert np.log(blocks) == pytest.approx(np.log(whole), abs=0.15)
 
@@ -116,17 +116,23 @@ def test_independent_sources_have_no_field() -> None:
     for k in range(300):
         sources = made_up(40, RandomField(0.03, 30.0), rng)
         moved = rng.standard_normal((40, 2)) if k % 2 else rng.standard_t(3.0, (40, 2))
-        found += find_field(sources._replace(found=0.03 * moved)) is not None
+        scattered = sources._replace(found=0.03 * moved)
+        found += find_field(scattered, sources.slopes) is not None
     assert found <= 15 + 4 * 15**0.5
 
 
 def test_no_field_without_sources() -> None:
     rng = np.random.default_rng(953)
     sources = made_up(40, RandomField(0.03, 60.0), rng)
-    assert find_field(sources) is not None
-    assert find_field(Placed(*(column[:19] for column in sources))) is None
+    assert find_field(sources, sources.slopes) is not None
+    few = Placed(*(column[:19] for column in sources))
+    assert find_field(few, few.slopes) is None
     on_a_line = sources._replace(images=sources.images * [1.0, 0.0])
-    assert find_field(on_a_line) is None
+    assert find_field(on_a_line, sources.slopes) is None
+    powers = (sources.images[:, :1] / 150.0) ** np.arange(30)
+    trend = np.zeros((40, 2, 60))
+    trend[:, 0, :30], trend[:, 1, 30:] = powers, powers
+    assert find_field(sources, trend) is None
 
 
 def test_sums_over_pairs_are_those_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:

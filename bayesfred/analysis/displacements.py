@@ -20,6 +20,7 @@ from bayesfred.analysis.random_field import (
     placed,
     shared_products,
 )
+from bayesfred.analysis.score_tests import with_more_terms
 from bayesfred.analysis.sources import SourceFits, fit_sources, tabulate
 from bayesfred.errors import InputError
 from bayesfred.io.summary_table import Table
@@ -157,7 +158,11 @@ def _of_frame(posterior: Posterior, params: Floats) -> tuple[DisplacementErrors,
     table = tabulate(posterior, fits)
     sources = placed(posterior, params, fits)
     alone = np.asarray(table["isolated"], dtype=bool)[sources.number]
-    field = find_field(Placed(*(column[alone] for column in sources)))
+    more, catalogue = with_more_terms(posterior.model.polynomial), posterior.model.sources
+    (u, v), x, y = sources.images.T, catalogue.x[sources.number], catalogue.y[sources.number]
+    terms = more.design_matrix(u, v, x, y).swapaxes(0, 1)
+    trend = np.concatenate([sources.slopes, terms], axis=2)
+    field = find_field(Placed(*(column[alone] for column in sources)), trend[alone])
     if field is None:
         return None
     slopes = shared_products(field, sources, sources.pulls)

@@ -1,17 +1,18 @@
 r"""The random field of displacements that neighbouring sources have in common, told by a frame.
 
 Source s is found x_s from where the coefficients put it, x_s = F_s c + d_s + e_s along each axis: c
-is what the fit took away from the displacements, d the random field of
-`model.displacement_errors`, and e_s has the variance of the source's counts and that of a scatter
-of its own. With V the covariance of d + e and c integrated out under a flat prior, x has the
+is what the fit took away from the displacements and what terms of up to two degrees more would, d
+the random field of `model.displacement_errors`, and e_s has the variance of the source's counts and
+that of a scatter of its own. What more terms describe is no random field but their lack, which
+other tests see. With V the covariance of d + e and c integrated out under a flat prior, x has the
 restricted likelihood
 
     -2 log L = log|V| + log|F^T V^-1 F| + x^T V^-1 x - x^T V^-1 F (F^T V^-1 F)^-1 F^T V^-1 x,
 
 of which the field's sd and length and the scatter are the maximum. Without the second term a field
-that terms have followed in part would seem to be weaker and shorter than it is. A displacement
-counts as `OUTLYING` standard deviations at most. There is a field if Akaike's criterion prefers its
-two numbers to none.
+that terms have followed in part would seem to be weaker and shorter than it is. A source displaced
+by more than `OUTLYING` standard deviations has as much larger an error. There is a field if
+Akaike's criterion prefers its two numbers to none.
 
 The field is split into blocks of neighbouring sources, halved across the longer side again and
 again, and blocks are taken as independent: a composite likelihood, of which pairs on both sides of
@@ -119,18 +120,21 @@ def placed(
     return Placed(some, images[some], fits.moved[some], errors[some], scatter, slopes[some])
 
 
-def find_field(sources: Placed) -> RandomField | None:
+def find_field(sources: Placed, trend: Floats) -> RandomField | None:
     """The field of displacements under which the sources' are most likely.
 
     Parameters
     ----------
     sources : Placed
         Isolated ones.
+    trend : ndarray, shape (n, 2, k)
+        Displacements that are none of the field's: those by the parameters and by more terms.
 
     Returns
     -------
     RandomField or None
-        None where sources are too few, on a line, or as likely displaced independently.
+        None where sources are on a line, as likely displaced independently, or too few to tell the
+        field from the trend.
     """
     try:
         step = distance_of_neighbours(sources.images) if len(sources.images) >= FEWEST else 0.0
@@ -138,17 +142,19 @@ def find_field(sources: Placed) -> RandomField | None:
         return None
     if not (step > 0.0 and np.any(sources.found)):
         return None
-    variance = np.diagonal(sources.errors, axis1=1, axis2=2)
-    bound = OUTLYING / np.sqrt(np.diagonal(sources.precision, axis1=1, axis2=2))
-    found = np.clip(sources.found, -bound, bound)
+    found, square = sources.found, 1.0 / np.diagonal(sources.precision, axis1=1, axis2=2)
+    far_off = np.maximum((found / OUTLYING) ** 2 - square, 0.0)
+    variance = np.diagonal(sources.errors, axis1=1, axis2=2) + far_off
     blocks = _blocks(sources.images, np.arange(len(found)))
     blocks = blocks[:: -(-len(blocks) // MOST)]
     some = np.concatenate(blocks)
-    slopes = _basis(sources.slopes[some].reshape(2 * some.size, -1)).reshape(some.size, 2, -1)
-    trend = np.zeros((*found.shape, slopes.shape[2]))
-    trend[some] = slopes
+    basis = _basis(trend[some].reshape(2 * some.size, -1)).reshape(some.size, 2, -1)
+    if basis.shape[2] > some.size:
+        return None
+    trend = np.zeros((*found.shape, basis.shape[2]))
+    trend[some] = basis
     distances = [distance.squareform(distance.pdist(sources.images[block])) for block in blocks]
-    size = float(np.std(found))
+    size = float(np.sqrt(np.mean(np.minimum(found**2, OUTLYING**2 * square))))
 
     def minus_log_likelihood(logs: Floats) -> float:
         sd, length, scatter = np.exp(logs)

@@ -59,7 +59,7 @@ from bayesfred.imaging.monomials import Exponents, degree_of, term_name
 from bayesfred.model.parameters import parameter_table
 from bayesfred.model.posterior import Posterior
 
-__all__ = ["FALSE_ALARM", "Lead", "ScoreTests", "score_tests"]
+__all__ = ["FALSE_ALARM", "Lead", "ScoreTests", "score_tests", "with_more_terms"]
 
 FALSE_ALARM = 0.003  # chance that any of these tests fails if the model is true
 RARE = 0.01  # of which the terms of the highest degree have
@@ -214,7 +214,7 @@ def score_tests(posterior: Posterior, params: Floats, fits: SourceFits | None = 
     >>> first.name, round(float(first.value + first.step), 1)
     ('psf_sigma', 2.1)
     """
-    model = replace(posterior.model, distortion=_with_more_terms(posterior.model.polynomial))
+    model = replace(posterior.model, distortion=with_more_terms(posterior.model.polynomial))
     nuisances = replace(
         posterior.nuisances,
         flux="scale" if posterior.nuisances.flux == "fixed" else posterior.nuisances.flux,
@@ -278,8 +278,17 @@ def _largest_order(posterior: Posterior) -> int:
     return max(own, 2)
 
 
-def _with_more_terms(distortion: PolynomialDistortion) -> PolynomialDistortion:
-    """The distortion with every x^i y^j that it lacks, up to two degrees more than it has."""
+def with_more_terms(distortion: PolynomialDistortion) -> PolynomialDistortion:
+    """The distortion with every x^i y^j that it lacks, up to two degrees more than it has.
+
+    Parameters
+    ----------
+    distortion : PolynomialDistortion
+
+    Returns
+    -------
+    PolynomialDistortion
+    """
     own, given = distortion.names, (distortion.f_terms, distortion.g_terms)
     old = _named(given)
     degree = 2 + max(sum(term) for _, term in old)
