@@ -28,7 +28,6 @@ from bayesfred.analysis.sources import fit_sources
 from bayesfred.analysis.verdict import judge_fit
 from bayesfred.commands.pipeline import with_displacements
 from bayesfred.model.displacement_errors import DisplacementErrors, RandomField
-from bayesfred.model.kernels.fisher import EXPECTED
 from bayesfred.optimize.fit_statistics import fit_statistics
 
 Floats = NDArray[np.float64]
@@ -189,10 +188,12 @@ def test_what_displacements_do_to_the_gradient() -> None:
         assert one == pytest.approx(other_one, rel=0.05, abs=0.02 * np.abs(one).max())
     best = bf.find_map(posterior)
     scattered = placed(posterior, best.params, fit_sources(posterior, best.params))
-    tau = best.params[posterior.parameter_names.index("position_scatter")]
-    assert scattered.scatter[0] == pytest.approx(tau**2 / EXPECTED * np.eye(2), rel=0.02, abs=1e-8)
-    with_scatter = np.linalg.inv(scattered.errors + scattered.scatter) @ scattered.slopes
-    assert scattered.pulls == pytest.approx(with_scatter)
+    # with these weights the information is that of the fit
+    covariance = scattered.errors + scattered.scatter
+    told = np.einsum("nak,nab,nbl->kl", scattered.pulls, covariance, scattered.pulls)
+    for name in ("f_x", "g_xy", "offset_x"):
+        k = posterior.parameter_names.index(name)
+        assert told[k, k] == pytest.approx(posterior.fisher(best.params)[k, k], rel=0.01)
 
 
 class Fitted(NamedTuple):
@@ -229,13 +230,14 @@ def mean_and_error(z: Floats, limit: float) -> tuple[float, float]:
 def test_errors_hold_where_neighbours_are_displaced_alike() -> None:
     """40 frames: 68 % and 95 % intervals within 3.5 Monte Carlo errors; without, far too narrow.
 
-    So are the scores of missing terms. The halves agree.
+    Scores of missing terms are as wide or wider, by a quarter at most. The halves agree.
     """
     found = fitted(40, TRUE)
-    for limit, share in ((1.0, 0.683), (1.96, 0.95)):
-        for z in (found.wider, found.wider_scores):
-            mean, error = mean_and_error(z, limit)
-            assert abs(mean - share) < 3.5 * error, (limit, mean, error)
+    for limit, share, widest in ((1.0, 0.683, 0.79), (1.96, 0.95, 0.986)):
+        mean, error = mean_and_error(found.wider, limit)
+        assert abs(mean - share) < 3.5 * error, (limit, mean, error)
+        mean, error = mean_and_error(found.wider_scores, limit)
+        assert share - 3.5 * error < mean < widest + 3.5 * error, (limit, mean, error)
     assert mean_and_error(found.plain, 1.0)[0] < 0.4
     assert mean_and_error(found.scores, 1.0)[0] < 0.55
     assert np.mean(found.p < 0.05) < 0.2 and np.mean(found.p > 0.95) < 0.2

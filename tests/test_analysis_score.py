@@ -17,8 +17,8 @@ from bayesfred.analysis.residuals import Residuals, judge_residuals
 from bayesfred.analysis.score_tests import (
     FALSE_ALARM,
     ScoreTests,
-    _with_more_terms,
     score_tests,
+    with_more_terms,
 )
 from bayesfred.analysis.verdict import FitVerdict, judge_fit
 from bayesfred.imaging.catalog import SourceCatalog
@@ -152,7 +152,7 @@ def test_scores_are_those_of_dense_algebra() -> None:
     posterior = simulated(model, 1)
     params = find_map(posterior).params
     found = score_tests(posterior, params)
-    more = replace(model, distortion=_with_more_terms(model.polynomial))
+    more = replace(model, distortion=with_more_terms(model.polynomial))
     score, covariance = dense_scores(posterior, params, more)
     scale = np.sqrt(np.diag(covariance))
     assert len(found.names) == 4 + 5 + 6 + 8
@@ -192,7 +192,7 @@ def test_a_frame_is_shared_by_models_of_other_backgrounds(noise: PoissonNoise) -
     ],
 )
 def test_added_terms_leave_the_others_as_they_are(lens: PolynomialDistortion) -> None:
-    more, rng = _with_more_terms(lens), np.random.default_rng(2)
+    more, rng = with_more_terms(lens), np.random.default_rng(2)
     names, point = more.names, rng.uniform(-30.0, 30.0, 4)
     design, own = more.design_matrix(*point), lens.design_matrix(*point)
     assert design[:, : lens.n_terms] == pytest.approx(own, rel=1e-12)

@@ -8,6 +8,7 @@ import pytest
 from scipy import ndimage
 
 import bayesfred as bf
+from bayesfred.model.added_errors import added_draws
 from bayesfred.model.kernels.psf_normal import psf_information, psf_slope, sample_psf
 from bayesfred.model.kernels.psf_samples import SourceSamples
 from bayesfred.model.psf_errors import PsfErrors
@@ -393,10 +394,10 @@ def test_what_a_psf_adds_is_that_of_a_joint_fit():
     errors = PsfErrors.of(("a", "b", "c"), i, np.cov(k @ draws.T))
     schur = np.linalg.inv(i - k @ np.linalg.inv(c) @ k.T)
     np.testing.assert_allclose(np.linalg.inv(i) + errors.covariance, schur, rtol=0.02, atol=2e-3)
-    moved = errors.displacements(20_000, 1)
+    moved = added_draws(errors.covariance, 20_000, 1)
     np.testing.assert_allclose(np.cov(moved.T), errors.covariance, rtol=0.1)
-    np.testing.assert_array_equal(moved, errors.displacements(20_000, 1))
-    assert not np.any(moved == errors.displacements(20_000, 2))
+    np.testing.assert_array_equal(moved, added_draws(errors.covariance, 20_000, 1))
+    assert not np.any(moved == added_draws(errors.covariance, 20_000, 2))
     scale = PsfErrors.of(("a", "b", "position_scatter"), i, np.cov(k @ draws.T))
     assert not np.any(scale.covariance[2]) and np.all(np.diag(scale.covariance)[:2] > 0.0)
 

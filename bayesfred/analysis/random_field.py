@@ -109,12 +109,12 @@ def placed(
     Placed
         Of the sources that are found.
     """
-    known = dict(zip(posterior.parameter_names, params, strict=True))
     errors, images, to_image = fits.moved_covariance, fits.own.image, fits.to_image
     told = np.isfinite(images + fits.moved).all(axis=1) & np.isfinite(errors).all(axis=(1, 2))
     some = np.flatnonzero(told)
     square = to_image[some] @ to_image[some].swapaxes(1, 2)
-    scatter = known.get("position_scatter", 0.0) ** 2 / EXPECTED * square
+    # as the information takes it: the average curvature of the shifts' prior
+    scatter = fits.scatter[some, None, None] / EXPECTED * square
     model, at = wanted or (posterior, params)
     slopes = to_image @ responses(model, at, fits)[:, 1:3]
     return Placed(some, images[some], fits.moved[some], errors[some], scatter, slopes[some])

@@ -79,8 +79,8 @@ def moved_by(names: tuple[str, ...], information: Floats, slopes: Floats) -> Flo
 
     Examples
     --------
-    >>> moved_by(("f_x", "model_error"), np.diag([2.0, 1.0]), np.ones((2, 2))).tolist()
-    [[0.25, 0.0], [0.0, 0.0]]
+    >>> moved_by(("f_x", "a.model_error"), np.diag([4.0, 1.0]), np.ones((2, 2))).tolist()
+    [[0.0625, 0.0], [0.0, 0.0]]
     """
     moved = np.flatnonzero([not name.endswith(SCALES) for name in names])
     block = information[np.ix_(moved, moved)]
