@@ -1,5 +1,6 @@
 """Neighbouring sources that are displaced alike: found, and independent ones not."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -129,3 +130,27 @@ def test_the_verdict_names_it_and_cross_check_does_not_trust_halves() -> None:
         assert found.record()["neighbours_factor"] > 1.3
         # the control: the halves alone are content, or call the errors too large
         assert replace(found, neighbours=None).verdict != "too small"
+
+
+def test_what_errors_have_already_is_not_said_again() -> None:
+    """A field, all or half of which is in the errors."""
+    rng = np.random.default_rng(944)
+    places = rng.uniform(-200.0, 200.0, (400, 2))
+    apart = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    whole = np.exp(-0.5 * (apart / 25.0) ** 2)
+    lower = np.linalg.cholesky(whole + 1e-9 * np.eye(400))
+    table = table_of(places, 0.03 * lower @ rng.standard_normal((400, 2)), 0.01)
+    table["isolated"][::7] = False  # pairs are those of the table
+
+    def shared(part: float) -> Callable[[NDArray[np.int64]], Floats]:
+        return lambda pairs: part * 9e-4 * np.tile(whole[pairs[:, 0], pairs[:, 1]], (2, 1))
+
+    none, half, all_of_it = (
+        neighbours(table, 0.03, known) for known in (None, shared(0.3), shared(1.0))
+    )
+    assert none is not None and half is not None and all_of_it is not None
+    assert none.alike and half.alike and not all_of_it.alike
+    assert half.correlation == none.correlation
+    assert half.expected == pytest.approx(0.3 * all_of_it.expected)
+    assert half.sd == pytest.approx(np.hypot(none.sd, 0.1 * half.expected))
+    assert none.expected == 0.0 and none.factor / 3.0 < half.factor < 0.7 * none.factor

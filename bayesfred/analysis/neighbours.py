@@ -29,6 +29,7 @@ from bayesfred.io.summary_table import Table
 FEWEST = 20  # sources
 OUTLYING = 3.0  # standard deviations, as which a displacement counts at most
 NOTICEABLE = 5.0  # standard deviations of the correlation
+FIELD = 0.1  # of the correlation that a field lets expect: its standard deviation, and its form's
 LONGEST = 2.0  # median distances between neighbours, beyond which two are none
 FOLLOWED = 8  # median distances to which the correlation is followed
 
@@ -47,7 +48,7 @@ class Neighbours(NamedTuple):
     sd : float
         Its standard deviation then.
     factor : float
-        Errors of coefficients over those with sources that are displaced independently.
+        Errors of coefficients over those with nothing in common but that field.
     """
 
     correlation: float
@@ -109,14 +110,21 @@ def neighbours(
     z = np.clip(table[2:4] / errors, -OUTLYING, OUTLYING)
     z -= z.mean(axis=1, keepdims=True)
     spread = np.maximum(z.std(axis=1, keepdims=True), 1e-300)
-    expected = 0.0
-    if shared is not None:
-        units = errors * spread
-        units = units[:, pairs[:, 0]] * units[:, pairs[:, 1]]
-        expected = float(np.mean(shared(numbers[pairs]) / units))
     z /= spread
-    found = Neighbours(_mean_product(z, pairs), expected, (2.0 * len(pairs)) ** -0.5, 1.0)
-    return found._replace(factor=_factor(z, places, pairs)) if found.alike else found
+    units = errors * spread
+
+    def products(pairs: Ints) -> tuple[float, float]:
+        """Sums over pairs of the displacements' products, and of what they are expected to be."""
+        one, two = pairs.T
+        expected = 0.0
+        if shared is not None:
+            expected = float(np.sum(shared(numbers[pairs]) / (units[:, one] * units[:, two])))
+        return float(np.sum(z[:, one] * z[:, two])), expected
+
+    mean, expected = (total / (2.0 * len(pairs)) for total in products(pairs))
+    sd = np.hypot((2.0 * len(pairs)) ** -0.5, FIELD * expected)
+    found = Neighbours(mean, expected, float(sd), 1.0)
+    return found._replace(factor=_factor(products, places, pairs)) if found.alike else found
 
 
 def distance_of_neighbours(places: Floats) -> float:
@@ -142,18 +150,13 @@ def _lengths(places: Floats, pairs: Ints) -> Floats:
     return np.asarray(np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]]).T))
 
 
-def _mean_product(z: Floats, pairs: Ints) -> float:
-    return float(np.mean(z[:, pairs[:, 0]] * z[:, pairs[:, 1]]))
-
-
-def _factor(z: Floats, places: Floats, pairs: Ints) -> float:
-    """Root of 1 + sum of the correlations, up to where they end."""
+def _factor(products: Callable[[Ints], tuple[float, float]], places: Floats, pairs: Ints) -> float:
+    """Root of 1 + sum of the correlations, up to where they end, over what it is expected to be."""
     step = float(np.median(_lengths(places, pairs)))
-    tree, total, before = spatial.cKDTree(places), 1.0, 0.0
+    tree, total, told, before = spatial.cKDTree(places), 1.0, 1.0, 0.0
     for lag in range(1, FOLLOWED + 1):
-        near = tree.query_pairs((lag + 0.5) * step, output_type="ndarray")
-        products = float(np.sum(z[:, near[:, 0]] * z[:, near[:, 1]]))
-        if products <= before:
+        found, expected = products(tree.query_pairs((lag + 0.5) * step, output_type="ndarray"))
+        if found <= before:
             break
-        total, before = 1.0 + products / len(places), products
-    return float(total**0.5)
+        total, told, before = 1.0 + found / len(places), 1.0 + expected / len(places), found
+    return float((total / max(told, 1.0)) ** 0.5)

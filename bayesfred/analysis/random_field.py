@@ -47,7 +47,7 @@ BLOCK = 250  # sources at most
 MOST = 8  # blocks
 EVALUATIONS = 150  # of the likelihood at most: a field that is there needs fewer
 REACH = 6.0  # lengths, beyond which the field is not followed
-ROWS = 1000  # sources whose pairs are made at a time
+ROWS, PAIRS = 1000, 20_000  # sources whose pairs are made at a time, and pairs
 TOLD = 1e-8  # of the largest singular value, below which coefficients are not told apart
 CLOSE = 0.02  # of the logarithms of sd, length and scatter
 NONE = 0.03  # of the displacements, at which a scatter makes no difference
@@ -229,13 +229,17 @@ class FieldLeft(NamedTuple):
         s = self.sources
         row = np.zeros(int(s.number.max()) + 1, dtype=int)
         row[s.number] = np.arange(s.number.size)
-        one, two = row[pairs.T]
         through = _through(self.field, s, s.pulls)
         taken = s.slopes @ self.covariance
-        both = np.einsum("nak,nal->kl", s.pulls, through)
-        left = self.field.covariance(np.hypot(*(s.images[one] - s.images[two]).T))
-        moved = np.einsum("pak,pak->ap", taken[one] @ both - through[one], taken[two])
-        return np.asarray(left + moved - np.einsum("pak,pak->ap", taken[one], through[two]))
+        both = taken @ np.einsum("nak,nal->kl", s.pulls, through) - through
+        out = np.empty((2, len(pairs)))
+        for first in range(0, len(pairs), PAIRS):
+            some = slice(first, first + PAIRS)
+            one, two = row[pairs[some].T]
+            left = self.field.covariance(np.hypot(*(s.images[one] - s.images[two]).T))
+            moved = np.einsum("pak,pak->ap", both[one], taken[two])
+            out[:, some] = left + moved - np.einsum("pak,pak->ap", taken[one], through[two])
+        return out
 
 
 def _through(field: RandomField, sources: Placed, moves: Floats) -> Floats:
