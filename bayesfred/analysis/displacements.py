@@ -175,15 +175,19 @@ def _of_frame(posterior: Posterior, params: Floats) -> tuple[DisplacementErrors,
 
 def _of_frames(joint: JointPosterior, params: Floats) -> JointPosterior:
     """What displacements add in every frame, which are independent of the others', and together."""
-    frames, total = dict(joint.frames), np.zeros((params.size, params.size))
+    moved, total = dict[str, DisplacementErrors](), np.zeros((params.size, params.size))
     for view in frame_views(joint):
         found = _of_frame(view.posterior, view.to_frame @ params)
         if found is not None:
-            frames[view.name] = replace(view.posterior, displacement_errors=found[0])
+            moved[view.name] = found[0]
             total += view.to_frame.T @ found[1] @ view.to_frame
-    if not total.any():
+    if not moved:
         return joint
     errors = DisplacementErrors(joint.parameter_names, widening(joint, params, total))
+    frames = {
+        name: replace(frame, displacement_errors=moved.get(name))
+        for name, frame in joint.frames.items()
+    }
     widened = with_frames(joint, frames)
     return replace(widened, psf_errors=joint.psf_errors, displacement_errors=errors)
 

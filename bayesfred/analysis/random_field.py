@@ -50,6 +50,7 @@ REACH = 6.0  # lengths, beyond which the field is not followed
 ROWS, PAIRS = 1000, 20_000  # sources whose pairs are made at a time, and pairs
 TOLD = 1e-8  # of the largest singular value, below which coefficients are not told apart
 CLOSE = 0.02  # of the logarithms of sd, length and scatter
+ROUNDING = 1e-12  # of a square of which the trend may leave nothing
 NONE = 0.03  # of the displacements, at which a scatter makes no difference
 AKAIKE = 4.0  # by which twice the logarithm of the likelihood has to be larger for two numbers
 
@@ -170,6 +171,7 @@ def find_field(sources: Placed, trend: Floats) -> RandomField | None:
                 products += both.T @ both
                 total += 2.0 * float(np.log(np.diag(lower)).sum())
         # the determinant of all is that of the trend times what it leaves of the square
+        products[-1, -1] *= 1.0 + ROUNDING
         lower = linalg.cholesky(products, lower=True)
         total += 2.0 * float(np.log(np.diag(lower)[:-1]).sum()) + float(lower[-1, -1] ** 2)
         return 0.5 * total
