@@ -273,8 +273,11 @@ def test_draws_and_maximum_have_the_wider_errors(widened: Widened, tmp_path: Pat
     chain = bf.laplace(other, wider, seed=1, path=path, progress=False)
     narrow = bf.laplace(posterior, best, seed=1, progress=False)
     some = slice(0, LENS.n_terms)
-    grown = chain.draws()[:, some].var(axis=0) - narrow.draws()[:, some].var(axis=0)
-    assert grown == pytest.approx(np.diag(added.covariance)[some], rel=0.15)
+    after, before = (each.draws()[:, some] for each in (chain, narrow))
+    off = after.var(axis=0) - before.var(axis=0) - np.diag(added.covariance)[some]
+    error = (2.0 / len(after)) ** 0.5 * after.var(axis=0)  # Monte Carlo
+    assert np.all(np.abs(off) < 4.0 * error)
+    assert np.all(np.diag(added.covariance)[some] > 10.0 * error)
     read = bf.open_chain(path).posterior().displacement_errors
     assert read is not None and read.field == added.field
     assert np.array_equal(read.covariance, added.covariance)

@@ -12,7 +12,8 @@ restricted likelihood
 of which the field's sd and length and the scatter are the maximum. Without the second term a field
 that terms have followed in part would seem to be weaker and shorter than it is. A source displaced
 by more than `OUTLYING` standard deviations has as much larger an error. There is a field if
-Akaike's criterion prefers its two numbers to none.
+Akaike's criterion prefers its two numbers to none. It is no longer than half the frame: what varies
+as slowly is the trend's.
 
 The field is split into blocks of neighbouring sources, halved across the longer side again and
 again, and blocks are taken as independent: a composite likelihood, of which pairs on both sides of
@@ -182,7 +183,8 @@ def find_field(sources: Placed, trend: Floats) -> RandomField | None:
         bounds=(least, largest), method="bounded", options={"xatol": CLOSE},
     )  # fmt: skip
     low = np.array([least, np.log(0.25 * step), least])
-    high = np.array([largest + 1.0, np.log(FOLLOWED * step), largest])
+    longest = min(FOLLOWED * step, 0.5 * float(np.ptp(sources.images, axis=0).max()))
+    high = np.array([largest + 1.0, np.log(longest), largest])
     best = optimize.minimize(
         minus_log_likelihood, np.log([0.7 * size, 1.5 * step, 0.7 * size]), method="Nelder-Mead",
         bounds=optimize.Bounds(low, high),
