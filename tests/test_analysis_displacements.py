@@ -29,6 +29,7 @@ from bayesfred.analysis.verdict import judge_fit
 from bayesfred.commands.pipeline import with_displacements
 from bayesfred.model.displacement_errors import DisplacementErrors, RandomField
 from bayesfred.optimize.fit_statistics import fit_statistics
+from bayesfred.sampling.frame_moves import FrameMove
 
 Floats = NDArray[np.float64]
 
@@ -374,6 +375,9 @@ def test_frames_have_fields_of_their_own() -> None:
     ratio = np.diag(total.covariance)[shared] / np.diag(own.covariance)[shared]
     assert np.all((ratio > 0.05) & (ratio < 0.8))  # a quarter if both frames told as much
     assert np.array_equal(one.covariance, other.frame_covariance("a", total.covariance))
+    moves = (FrameMove.of(j, e, j.log_parts) for j, e in ((other, wider), (joint, best)))
+    one_lower, two_lower = (move.shared.lowers for move in moves)
+    assert np.ravel(one_lower) == pytest.approx(np.ravel(two_lower), rel=1e-6, abs=1e-12)
     found = bf.cross_check(other, estimate=wider)
     assert found.verdict != "too small"
     chain = bf.laplace(other, wider, seed=1, progress=False)
