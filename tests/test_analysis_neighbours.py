@@ -9,6 +9,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 import bayesfred as bf
+from bayesfred.analysis.causes.pixels import displaced_alike
 from bayesfred.analysis.neighbours import NOTICEABLE, neighbours
 from bayesfred.analysis.residuals import judge_residuals
 from bayesfred.analysis.verdict import judge_fit
@@ -124,6 +125,9 @@ def test_the_verdict_names_it_and_cross_check_does_not_trust_halves() -> None:
             continue
         assert not verdict.fits_data and verdict.causes[-1].name == "displaced neighbours"
         assert "neighbouring sources are displaced alike" in verdict.sentence
+        assert verdict.causes[-1].remedy == "add terms to the distortion"
+        fixed = displaced_alike(residuals.neighbours, scatters=False)
+        assert "set nuisances.position_scatter = true" in fixed.remedy
         assert found.verdict == "too small" and not found.holds
         assert "which both halves have in common" in found.message
         assert found.record()["neighbours_correlation"] > 0.3

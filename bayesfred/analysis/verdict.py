@@ -115,7 +115,8 @@ def judge_fit(
             causes = (correlated_pixels(residuals.shared),)
         causes = causes or hidden_causes(posterior, params, residuals.scores, residuals.tests)
         if consist and residuals.neighbours is not None and residuals.neighbours.alike:
-            causes = (*causes, displaced_alike(residuals.neighbours))
+            scatters = posterior.nuisances.position_scatter
+            causes = (*causes, displaced_alike(residuals.neighbours, scatters=scatters))
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
     if fits and not estimate.fits_data:

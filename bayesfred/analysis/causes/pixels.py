@@ -177,16 +177,24 @@ def correlated_pixels(shared: SharedNoise) -> Cause:
     )  # fmt: skip
 
 
-def displaced_alike(found: Neighbours) -> Cause:
-    """What displaces neighbouring sources alike, and is in no term of the distortion."""
+def displaced_alike(found: Neighbours, *, scatters: bool) -> Cause:
+    """What displaces neighbouring sources alike, and is in no term of the distortion.
+
+    Where positions scatter a fit has such displacements in its errors but for what terms describe.
+    """
+    remedy = "add terms to the distortion"
+    if not scatters:
+        remedy += (
+            ", or set nuisances.position_scatter = true, by which a fit has such displacements in "
+            "its errors"
+        )
     return Cause(
         "displaced neighbours", 1.0,
         f"neighbouring sources are displaced alike (correlation {found.correlation:.2f}), by what "
         "is finer than the distortion's terms and not independent from source to source, such as "
         "ghosts or the target's own errors: errors of the coefficients are some "
         f"{found.factor:.2g} times these",
-        "add terms to the distortion, or set nuisances.position_scatter = true, by which a fit has "
-        "such displacements in its errors",
+        remedy,
     )  # fmt: skip
 
 
