@@ -174,11 +174,54 @@ def growth(
     ):
         value = ratio(with_threads(1, lambda kind=kind: kind.log_prob(walkers)), fixed, 10)
         rows.append((f"log-posterior, free fluxes {name} / fixed", value, bound))
+    stars_at = half_seen()
+    value = ratio(stars_at(1.0), stars_at(8.0), 10)
+    rows.append(("log-posterior, 144 touching stars, one about to change place / none", value, 2.0))
     peak = subprocess.run(
         [sys.executable, "-c", MEMORY], capture_output=True, text=True, check=True
     ).stdout
     rows.append(("peak memory of an image / the frame's bytes", float(peak), 4.0))
     return rows
+
+
+def half_seen() -> Callable[[float], Callable[[], object]]:
+    """Log-posteriors of 144 stars that touch and scatter, of one of which half is masked.
+
+    They are evaluated at eight scatters, times a factor. At 1 the half-seen star's shift has two
+    maxima, of which one ends.
+    """
+    rng, scatter, error = np.random.default_rng(1), 6e-4, 4e-3
+    x, y = (each.ravel() for each in np.meshgrid(*[18.0 * np.arange(12) - 99.0] * 2))
+    moved = 2.0 * scatter * rng.standard_normal((2, x.size))
+    moved[:, 0] = 0.07, 0.05
+    flux, lens = np.full(x.size, 2e5), bf.PolynomialDistortion.polynomial(2)
+    detector = bf.Detector((216, 216))
+    stars, wider = (
+        bf.ForwardModel(detector, bf.SourceCatalog(*at, flux), bf.GaussianPSF(sigma), lens)
+        for at, sigma in (((x, y), 1.6), ((x + moved[0], y + moved[1]), 1.62))
+    )
+    mean = wider.expected_counts(np.zeros(lens.n_terms), 500.0)
+    sd = np.sqrt(mean + 17.0**2 + (error * (mean - 500.0)) ** 2)
+    u, v = (each + 99.0 for each in detector.pixel_centres())
+    away = np.hypot(u, v[:, None])
+    posterior = bf.Posterior(
+        stars,
+        mean + sd * rng.standard_normal(mean.shape),
+        noise=bf.PoissonNoise(17.0),
+        nuisances=bf.Nuisances("free", position_scatter=True, model_error=True),
+        mask=(away > 9.0) | ((u < 0.7) & (away < 8.0)),
+    )
+    known = {"background": 500.0, "model_error": error}
+    params = np.array([[known.get(name, 0.0) for name in posterior.parameter_names]] * 8)
+
+    def at(factor: float) -> Callable[[], object]:
+        rows = params.copy()
+        rows[:, posterior.parameter_names.index("position_scatter")] = (
+            factor * scatter * np.geomspace(0.9, 1.6, 8)
+        )
+        return with_threads(1, lambda: posterior.log_prob(rows))
+
+    return at
 
 
 def calibration() -> Callable[[], object]:

@@ -505,3 +505,42 @@ def test_a_source_without_pixels_changes_nothing(radius: float) -> None:
     params = np.array([0.02, 1.0, 0.2])
     assert whole.log_prob(params) == pytest.approx(rest.log_prob(params), abs=0.05)
     assert whole.fluxes(params)[2] == pytest.approx(400.0, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "tau"), [(61, 1.24773e-3), (472, 9.4215e-4)])
+def test_a_source_that_crawls_in_a_large_cluster_ends_where_it_does_alone(
+    seed: int, tau: float
+) -> None:
+    """Footprints touch, but the pixels in the likelihood have light of one source alone."""
+    rng, side = np.random.default_rng(seed), 5
+    cut, error = rng.uniform(-1.5, 3.0), 10.0 ** rng.uniform(-2.5, -1.3)
+    far, angle = rng.uniform(0.02, 0.2), rng.uniform(0.0, 6.28)
+    x, y = (each.ravel() for each in np.meshgrid(*[18.0 * np.arange(side) - 36.0] * 2))
+    moved = 2.0 * tau * rng.standard_normal((2, side**2))
+    moved[:, 12] = far * np.cos(angle), far * np.sin(angle)
+    flux, detector = rng.uniform(1e5, 3e5, side**2), Detector((100, 100))
+    catalogue = SourceCatalog(x, y, flux)
+    model = make_model(catalogue, sigma=1.6, detector=detector)
+    there = SourceCatalog(x + moved[0], y + moved[1], flux)
+    wider = make_model(there, sigma=1.62, detector=detector)
+    mean = wider.expected_counts(np.zeros(wider.distortion.n_terms), 500.0)
+    sd = np.sqrt(mean + 17.0**2 + (error * (mean - 500.0)) ** 2)
+    counts = mean + sd * rng.standard_normal(mean.shape)
+    v, u = np.mgrid[:100, :100] - 49.5
+    cells = np.hypot(u - x[:, None, None], v - y[:, None, None]) < 7.0
+    cells[12] &= u < cut
+    nuisances = Nuisances("free", position_scatter=True, model_error=True)
+    whole = Posterior(
+        model, counts, noise=PoissonNoise(17.0), nuisances=nuisances, mask=cells.any(axis=0)
+    )
+    assert np.isfinite(whole.log_prob(whole.start()))
+    known = {"background": 500.0, "model_error": error}
+    params = np.array([[known.get(name, 0.0) for name in whole.parameter_names]] * 5)
+    params[:, whole.parameter_names.index("position_scatter")] = tau * np.linspace(0.99, 1.01, 5)
+    apart = np.zeros(len(params))
+    for s in range(side**2):
+        one = replace(model, sources=SourceCatalog(x[s : s + 1], y[s : s + 1], flux[s : s + 1]))
+        alone = Posterior(one, counts, noise=PoissonNoise(17.0), nuisances=nuisances, mask=cells[s])
+        apart += alone.log_prob(params) - alone.log_prior(params)
+    assert whole.log_prob(params) - whole.log_prior(params) == pytest.approx(apart, abs=0.01)

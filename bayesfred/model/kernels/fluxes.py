@@ -52,8 +52,9 @@ from bayesfred.model.kernels.flux_newton import (
 )
 from bayesfred.model.kernels.noise_dispatch import by_exactness, given
 from bayesfred.model.kernels.patches import add_patch, fill_excess, new_patch, weigh_patch
+from bayesfred.model.kernels.settling import alone, maximize, settle
 from bayesfred.model.kernels.shift_modes import other_mode
-from bayesfred.model.kernels.shift_newton import change_source, log_density, log_prior, maximize
+from bayesfred.model.kernels.shift_newton import change_source, log_density, log_prior
 from bayesfred.model.kernels.starts import start
 
 TRIES = 4  # other modes that are looked at in a cluster
@@ -95,6 +96,15 @@ def _log_evidence(frame, parameters, cluster, h):
 
 
 @inner()
+def _settled(frame, parameters, source):
+    """What they say of one source, the others being as they are."""
+    h = np.empty(6)
+    if not settle(frame, parameters, source, h):
+        return math.nan
+    return _log_evidence(frame, parameters, source, h)
+
+
+@inner()
 def _climb(frame, parameters, cluster, known, h):
     """The same for the highest mode: a shift may have two, see `shift_modes.py`."""
     gain = maximize(frame, parameters, cluster, known, h)
@@ -110,23 +120,29 @@ def _climb(frame, parameters, cluster, known, h):
         i = gains.argmax()
         if gains[i] < TIE:
             break
+        gains[i] = -math.inf
+        # by itself first, which tells nearly as well whether the other mode is higher
+        source, s = alone(cluster, i), members[i]
+        old_fluxes, old_shifts = fluxes[members], shifts[members]
         if factor.size == 0:
             value, factor = gain + _log_evidence(frame, parameters, cluster, h), np.empty(h.size)
-        gains[i] = -math.inf
-        old_fluxes, old_shifts = fluxes[members], shifts[members]
-        dx, dy = (ratios[i] - 1.0) * old_shifts[i]
-        change_source(cluster, members[i], 0.0, dx, dy, 0.0)
-        more = maximize(frame, parameters, cluster, known, factor)
-        if not math.isnan(more):
-            there = more + _log_evidence(frame, parameters, cluster, factor)
-            if there > value:
-                value, gain = there, more
-                copy(factor, h)
-                continue
+        here = _settled(frame, parameters, source)
+        dx, dy = ratios[i] * old_shifts[i] - shifts[s]
+        change_source(cluster, s, 0.0, dx, dy, 0.0)
+        there = _settled(frame, parameters, source)
+        if not there - here <= TIE:  # or where neither is known
+            more = maximize(frame, parameters, cluster, known, factor)
+            if not math.isnan(more):
+                there = more + _log_evidence(frame, parameters, cluster, factor)
+                if there > value:
+                    value, gain = there, more
+                    copy(factor, h)
+                    continue
         for j in range(members.size):
             s = members[j]
-            back_x, back_y = old_shifts[j] - shifts[s]
-            change_source(cluster, s, old_fluxes[j] - fluxes[s], back_x, back_y, 0.0)
+            flux, (dx, dy) = old_fluxes[j] - fluxes[s], old_shifts[j] - shifts[s]
+            if flux != 0.0 or dx != 0.0 or dy != 0.0:
+                change_source(cluster, s, flux, dx, dy, 0.0)
     return gain
 
 

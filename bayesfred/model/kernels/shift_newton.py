@@ -56,7 +56,7 @@ ENOUGH = 3e-6  # error of the log-likelihood for every source, with which a sear
 
 
 @inner()
-def _fill_gradient(cluster, out):
+def fill_gradient(cluster, out):
     """The gradient of log L + log p in a cluster's fluxes and shifts."""
     fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
     size = stamps.shape[0]
@@ -124,7 +124,7 @@ def change_source(cluster, s, flux, dx, dy, still):
 
 
 @inner()
-def _take_step(cluster, step, shares, together, still):
+def take_step(cluster, step, shares, together, still):
     """Move by at most these shares of a Newton step, or by the smallest; leave them in `shares`."""
     fp, stamps, members = cluster.layout.footprints, cluster.touching.stamps, cluster.group.members
     fluxes, size, least = cluster.fluxes, cluster.touching.stamps.shape[0], math.inf
@@ -168,18 +168,24 @@ def _subtract_second_derivatives(cluster, i, out):
 
 
 @inner()
+def curve(cluster, bends, h, out):
+    """Fill H less the second derivatives."""
+    copy(h, out)
+    start, members = cluster.group.start, cluster.group.members
+    for i in range(members.size):
+        if bends.size > 0:
+            add_block(i, start, out, bends[members[i]])
+        else:
+            _subtract_second_derivatives(cluster, i, out)
+        xx, xy, yy = bend_prior(cluster.shifts[members[i]], cluster.prior.scatter)
+        add_block(i, start, out, (0.0, 0.0, 0.0, xx, xy, yy))
+
+
+@inner()
 def _factor(cluster, bends, h, lower):
     """Cholesky's factor of H, less the second derivatives where that is possible, in `lower`."""
     if cluster.touching.stamps.shape[0] > 1:
-        copy(h, lower)
-        start, members = cluster.group.start, cluster.group.members
-        for i in range(members.size):
-            if bends.size > 0:
-                add_block(i, start, lower, bends[members[i]])
-            else:
-                _subtract_second_derivatives(cluster, i, lower)
-            xx, xy, yy = bend_prior(cluster.shifts[members[i]], cluster.prior.scatter)
-            add_block(i, start, lower, (0.0, 0.0, 0.0, xx, xy, yy))
+        curve(cluster, bends, h, lower)
         if cholesky(lower, cluster.group):
             return True
         copy(h, lower)  # far from the maximum
@@ -216,21 +222,36 @@ def log_prior(cluster):
 
 
 @inner()
-def log_density(frame, parameters, cluster):
-    """Log L + log p of a cluster's fluxes and shifts, up to constants."""
-    patch, noise, value = cluster.patch, given(frame.noise, parameters), 0.0
-    for j in range(patch.first.size):
-        a, b, first = patch.start[j], patch.start[j + 1], patch.first[j]
-        image = patch.image[a:b]
-        part = stretch(frame, parameters.background, patch.top + j, first, image)
-        slope_run(part, patch.score[a:b])
-        mean = (patch.score[a:b], part.row[0], None)
-        value += sum_pixels(noise, part.values, image, mean, first)
-    return value + log_prior(cluster)
+def _sum_run(frame, noise, background, patch, place):
+    """Log L of pixels [a, b) of a patch, which are in row j of it."""
+    j, a, b = place
+    image, first = patch.image[a:b], patch.first[j] + a - patch.start[j]
+    part = stretch(frame, background, patch.top + j, first, image)
+    slope_run(part, patch.score[a:b])
+    return sum_pixels(noise, part.values, image, (patch.score[a:b], part.row[0], None), first)
 
 
 @inner()
-def _turn_back(frame, parameters, cluster, way, value):
+def log_density(frame, parameters, cluster):
+    """Log L + log p of a cluster's fluxes and shifts, up to constants.
+
+    Of one source in its own pixels.
+    """
+    patch, noise, value = cluster.patch, given(frame.noise, parameters), log_prior(cluster)
+    fp, members, at = cluster.layout.footprints, cluster.group.members, cluster.canvas.at
+    if members.size == 1:
+        for p in range(fp.first[members[0]], fp.first[members[0] + 1]):
+            place = fp.row[p] - patch.top, at[p], at[p] + fp.size[p]
+            value += _sum_run(frame, noise, parameters.background, patch, place)
+    else:
+        for j in range(patch.first.size):
+            place = j, patch.start[j], patch.start[j + 1]
+            value += _sum_run(frame, noise, parameters.background, patch, place)
+    return value
+
+
+@inner()
+def turn_back(frame, parameters, cluster, way, value):
     """Go back by half a step, and half of that, until the log-density is not lower than `value`.
 
     Blended sources far from their maximum may go too far again and again. `way` is the step and
@@ -262,12 +283,22 @@ def _change_of_width(cluster, nearby, shares, step):
     return total
 
 
+@leaf()
+def _count_left(distances):
+    """How many sources are not at their maximum yet."""
+    left = 0
+    for distance in distances:
+        left += distance > CLOSE
+    return left
+
+
 @inner()
-def maximize(frame, parameters, cluster, known, h):
+def search(frame, parameters, cluster, known, h, left):
     """Newton's iteration for a cluster; leaves Cholesky's factor of H in h.
 
     Returns what the rest of the way to the maximum gains, which is nothing unless e is known; NaN
-    if it fails.
+    if it fails; infinity where no more sources are left than the second of `left`. Into the first
+    go the squares of the sources' distances.
     """
     touching, group, patch, at = cluster.touching, cluster.group, cluster.patch, cluster.canvas.at
     size, noise = touching.stamps.shape[0], given(frame.noise, parameters)
@@ -275,8 +306,9 @@ def maximize(frame, parameters, cluster, known, h):
     close, enough = CLOSE * group.members.size, ENOUGH * group.members.size
     step, lower = np.zeros(group.lead.size), h.copy() if size > 1 else h
     distance, rate, converged = 0.0, 1.0, False
-    shares, distances = np.ones(group.members.size), np.zeros(group.members.size)
-    gradient = np.empty(step.size)
+    shares, gradient = np.ones(group.members.size), np.empty(step.size)
+    distances, few = left
+    distances[:] = 0.0
     value = -math.inf
     for visit in range(VISITS if early else MOST_VISITS):
         weigh_patch(frame, noise, parameters.background, patch, (0, patch.first.size), None)
@@ -286,7 +318,7 @@ def maximize(frame, parameters, cluster, known, h):
             add_prior(h, group, cluster.prior, cluster.fluxes, cluster.shifts, SHARE)
         if converged and not early:
             return 0.0 if cholesky(h, group) else math.nan
-        _fill_gradient(cluster, gradient)
+        fill_gradient(cluster, gradient)
         if fresh and not converged and not _factor(cluster, known.nearby.bends, h, lower):
             return math.nan
         if not exact:
@@ -309,14 +341,16 @@ def maximize(frame, parameters, cluster, known, h):
             if error <= enough:
                 gain = 0.5 * np.dot(shares, distances) + width
                 return gain if cholesky(h, group) else math.nan
+        if 0 < _count_left(distances) <= few:
+            return math.inf
         # templates follow by second derivatives that are right only about: steps must get shorter
         still = 0.0 if rate > 0.1 else (STILL_EARLY if early else STILL)
-        _take_step(cluster, step, shares, exact, still)
+        take_step(cluster, step, shares, exact, still)
         if visit >= PATIENT and size > 1 and distance > CERTAIN:
             way = step, shares
-            value = _turn_back(frame, parameters, cluster, way, value)
+            value = turn_back(frame, parameters, cluster, way, value)
         if visit > ENDLESS and size > 1 and distance <= FLAT:
             return 0.0 if cholesky(h, group) else math.nan
-        left = distance * min(rate, 1.0)
-        converged = left <= close or (early and 0.5 * left * math.sqrt(rate) <= enough)
+        rest = distance * min(rate, 1.0)
+        converged = rest <= close or (early and 0.5 * rest * math.sqrt(rate) <= enough)
     return math.nan
