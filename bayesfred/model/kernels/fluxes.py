@@ -34,7 +34,7 @@ import math
 
 import numpy as np
 
-from bayesfred.imaging.kernels.compilation import inner, shared
+from bayesfred.imaging.kernels.compilation import inner, leaf, shared
 from bayesfred.imaging.kernels.contexts import Canvas
 from bayesfred.imaging.kernels.fastmath import REDUCE
 from bayesfred.imaging.kernels.geometry import move
@@ -58,6 +58,7 @@ from bayesfred.model.kernels.shift_newton import change_source, log_density, log
 from bayesfred.model.kernels.starts import start
 
 TRIES = 4  # other modes that are looked at in a cluster
+LONE = 0.02  # of a source's light: what others may have in its image
 TIE = -2.0  # in log-density: another mode that is predicted to be this much lower is looked at
 
 
@@ -95,6 +96,19 @@ def _log_evidence(frame, parameters, cluster, h):
     return log_density(frame, parameters, cluster) - _half_log_determinant(cluster, h)
 
 
+@leaf(fastmath=REDUCE)
+def _lone(cluster, s):
+    """Whether a source's image has hardly any light of others in it."""
+    fp, unit, at = cluster.layout.footprints, cluster.touching.stamps[0], cluster.canvas.at
+    image, own, every = cluster.patch.image, 0.0, 0.0
+    for p in range(fp.first[s], fp.first[s + 1]):
+        first = fp.start[p]
+        for k in range(fp.size[p]):
+            own += unit[first + k] * unit[first + k]
+            every += unit[first + k] * image[at[p] + k]
+    return every < (1.0 + LONE) * cluster.fluxes[s] * own
+
+
 @inner()
 def _settled(frame, parameters, source):
     """What they say of one source, the others being as they are."""
@@ -121,16 +135,18 @@ def _climb(frame, parameters, cluster, known, h):
         if gains[i] < TIE:
             break
         gains[i] = -math.inf
-        # by itself first, which tells nearly as well whether the other mode is higher
-        source, s = alone(cluster, i), members[i]
+        source, s, higher = alone(cluster, i), members[i], math.nan
         old_fluxes, old_shifts = fluxes[members], shifts[members]
         if factor.size == 0:
             value, factor = gain + _log_evidence(frame, parameters, cluster, h), np.empty(h.size)
-        here = _settled(frame, parameters, source)
+        lone = _lone(cluster, s)
+        if lone:
+            higher = -_settled(frame, parameters, source)
         dx, dy = ratios[i] * old_shifts[i] - shifts[s]
         change_source(cluster, s, 0.0, dx, dy, 0.0)
-        there = _settled(frame, parameters, source)
-        if not there - here <= TIE:  # or where neither is known
+        if lone:  # it tells by itself whether the other mode is higher
+            higher += _settled(frame, parameters, source)
+        if not higher <= TIE:
             more = maximize(frame, parameters, cluster, known, factor)
             if not math.isnan(more):
                 there = more + _log_evidence(frame, parameters, cluster, factor)
