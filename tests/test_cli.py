@@ -1507,7 +1507,7 @@ def test_real_frame(tmp_path: Path) -> None:
     assert "hidden by them: rows 52 of the catalogue" in output.stdout
     verdict = output.stdout.strip().splitlines()[-1]
     found = re.search("trustworthy: The model fits the counts: .*efficiency ([0-9]+)%", verdict)
-    # 80 % of 1,000 draws; 64 draws know it to 6 %. It must be 80 % to be trusted unsampled
+    # 80 % of 1,000 draws; 64 draws know it to 6 %
     assert found is not None and int(found[1]) > 80 - 4 * 6
     assert output.code == (3 if verdict.startswith("not ") else 0)
     assert ("sample it" in verdict) == (output.code == 3)

@@ -34,7 +34,7 @@ def test_everything_is_written_and_the_verdict_says_what_was_done(
     assert "Median and middle 68 %" not in page and ">nan<" not in page
     found = diagnose(open_chain(folder / "run.h5"))
     assert found.sampled_well is None and found.trustworthy and found.at_maximum
-    assert found.importance_efficiency > 0.9
+    assert found.approximation.efficiency > 0.9
 
 
 def test_errors_are_those_of_the_sampled_run(

@@ -158,7 +158,7 @@ def test_laplace_draws_come_from_all_modes() -> None:
     error = np.sqrt(modes.weights * (1.0 - modes.weights) / len(offset))
     assert np.all(np.abs(near.mean(axis=0) - modes.weights) < 5.0 * error + 1e-3)
     verdict = diagnose(chain)
-    assert verdict.importance_efficiency > 0.9 and "modes" in verdict.verdict
+    assert verdict.approximation.efficiency > 0.9 and "modes" in verdict.verdict
 
 
 def test_modes_are_told() -> None:

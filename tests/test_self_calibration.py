@@ -24,7 +24,7 @@ from bayesfred.model.dithered import DitheredPosterior
 from bayesfred.model.movable import MovableLikelihood
 from bayesfred.optimize.dithers import link_peaks, shifts_between
 from bayesfred.sampling.chainfile import open_chain
-from bayesfred.sampling.laplace import importance_efficiency
+from bayesfred.sampling.laplace import check_approximation
 
 FREE = bf.Nuisances(flux="free")
 LENS = bf.PolynomialDistortion.polynomial(3)
@@ -536,7 +536,7 @@ def test_laplace_and_find_map_run_on_the_posterior(found, tmp_path) -> None:
     path = tmp_path / "dithers.h5"
     chain = bf.laplace(found.posterior, found.estimate, seed=1, draws=64, path=path, progress=False)
     assert chain.draws().shape == (64, found.posterior.n_parameters)
-    assert importance_efficiency(chain) > 0.5
+    assert check_approximation(chain).efficiency > 0.5
     stored = open_chain(path)
     assert np.array_equal(stored.chain, chain.chain)
     rebuilt, draws = stored.posterior(), chain.draws()[:4]

@@ -12,7 +12,7 @@ from bayesfred.model.noise import correlation_ratio
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import convergence
 from bayesfred.sampling.displacement import frame_posterior
-from bayesfred.sampling.laplace import MIN_EFFICIENCY, importance_efficiency
+from bayesfred.sampling.laplace import check_approximation
 
 __all__ = ["comparable_posteriors", "require_sampled"]
 
@@ -71,9 +71,9 @@ def require_sampled(name: str, chain: Chain) -> None:
         acceptance = float(np.mean(chain.accepted)) / max(chain.chain.shape[1], 1)
         well, said = judge_sampling(chain, rhat, np.minimum(*ess), acceptance, chain.target_ess, "")
     else:
-        efficiency = importance_efficiency(chain)
-        well = efficiency >= MIN_EFFICIENCY and chain.estimate.at_maximum
-        said = judge_approximation(chain, efficiency)
+        approximation = check_approximation(chain)
+        well = approximation.holds and chain.estimate.at_maximum
+        said = judge_approximation(chain, approximation)
     if not well:
         raise InputError(
             f"{name}: got draws that do not represent the posterior, expected a well sampled "

@@ -44,7 +44,7 @@ from bayesfred.model.threads import one_blas_thread
 from bayesfred.optimize.fit_statistics import fit_statistics
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.convergence import autocorrelation, convergence
-from bayesfred.sampling.laplace import MIN_EFFICIENCY, importance_efficiency
+from bayesfred.sampling.laplace import ApproximationCheck, check_approximation
 from bayesfred.sampling.sampler import check_density
 from bayesfred.sampling.summary import summary
 
@@ -77,9 +77,9 @@ class Diagnostics:
         Rank-normalised split R-hat between ensembles, by parameter.
     ess_bulk, ess_tail : dict of str to float
         Effective numbers of draws for the centre and for the 5 % and 95 % quantiles, by parameter.
-    importance_efficiency : float
-        How well draws of the Laplace approximation represent the posterior, from 0 to 1, see
-        `bayesfred.sampling.laplace`; nan of a sampled chain.
+    approximation : ApproximationCheck or None
+        How well draws of the Laplace approximation represent the posterior, see
+        `bayesfred.sampling.laplace`; None of a sampled chain.
     at_maximum : bool
         Whether the MAP is at the maximum.
     tau : dict of str to float
@@ -140,7 +140,7 @@ class Diagnostics:
     rhat: dict[str, float]
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
-    importance_efficiency: float
+    approximation: ApproximationCheck | None
     at_maximum: bool
     tau: dict[str, float]
     acceptance: float
@@ -179,12 +179,11 @@ class Diagnostics:
         """Whether the model fits the counts, and the draws represent the posterior.
 
         They do where the run is sampled well; those of a Laplace approximation where the MAP is at
-        the maximum and the importance efficiency is at least 0.8.
+        the maximum, and the approximation holds.
         """
-        if self.sampled_well is None:
-            close = self.importance_efficiency >= MIN_EFFICIENCY
-            return self.fits_data and self.at_maximum and close
-        return self.sampled_well and self.fits_data
+        if self.approximation is not None:
+            return self.fits_data and self.at_maximum and self.approximation.holds
+        return bool(self.sampled_well) and self.fits_data
 
     @property
     def message(self) -> str:
@@ -292,8 +291,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         rejected = "reject_outliers = true" in settings.splitlines()
         fitted = judge_fit(posterior, best, fit, residuals, rejected=rejected)
     rhat, bulk, tail, tau = np.full((4, len(names)), np.nan)
-    acceptance = efficiency = np.nan
-    sampled_well = None
+    acceptance, approximation, sampled_well = np.nan, None, None
     if chain.method == "mcmc":
         rhat, bulk, tail = convergence(kept)
         walkers = kept.transpose(3, 0, 2, 1).reshape(len(names), n_ensembles * n_walkers, n_steps)
@@ -303,8 +301,8 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
             chain, rhat, np.minimum(bulk, tail), acceptance, target_ess, fitted.unmatched
         )
     else:
-        efficiency = importance_efficiency(chain)
-        sampling = judge_approximation(chain, efficiency)
+        approximation = check_approximation(chain)
+        sampling = judge_approximation(chain, approximation)
     if residuals is not None and not fitted.fits_data and chain.whole is None:
         robust = _by_name(names, robust_sd(posterior, best.params, best.covariance))
     if predictive and not frames:
@@ -321,7 +319,7 @@ def diagnose(chain: Chain, *, target_ess: float = 1000.0, predictive: int = 0) -
         rhat=_by_name(names, rhat),
         ess_bulk=_by_name(names, bulk),
         ess_tail=_by_name(names, tail),
-        importance_efficiency=float(efficiency),
+        approximation=approximation,
         at_maximum=chain.estimate.at_maximum,
         tau=_by_name(names, tau),
         acceptance=acceptance,

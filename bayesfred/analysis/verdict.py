@@ -26,7 +26,7 @@ from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
 from bayesfred.sampling.chain import Chain
-from bayesfred.sampling.laplace import MIN_EFFICIENCY
+from bayesfred.sampling.laplace import ApproximationCheck
 
 __all__ = [
     "FitVerdict",
@@ -188,25 +188,21 @@ def judge_sampling(
     )
 
 
-def judge_approximation(chain: Chain, efficiency: float) -> str:
+def judge_approximation(chain: Chain, approximation: ApproximationCheck) -> str:
     """Say whether the draws of a Laplace approximation represent the posterior.
 
     Parameters
     ----------
     chain : Chain
-    efficiency : float
-        See `bayesfred.sampling.laplace.importance_efficiency`.
+    approximation : ApproximationCheck
 
     Returns
     -------
     str
     """
     failures = _not_at_maximum(chain) + _incomplete(chain)
-    if not efficiency >= MIN_EFFICIENCY:
-        failures.append(
-            f"the posterior is not normal (importance efficiency {efficiency:.0%} is below "
-            f"{MIN_EFFICIENCY:.0%}): sample it"
-        )
+    if not approximation.holds:
+        failures.append(f"the posterior is not normal ({approximation}): sample it")
     if failures:
         wrong = "; ".join(failures)
         return (
@@ -214,8 +210,8 @@ def judge_approximation(chain: Chain, efficiency: float) -> str:
             f"{_several(chain)}"
         )
     return (
-        "Not sampled: errors are those of the information at the maximum (importance efficiency "
-        f"{efficiency:.0%}).{_several(chain)}"
+        f"Not sampled: errors are those of the information at the maximum ({approximation})."
+        f"{_several(chain)}"
     )
 
 

@@ -373,8 +373,10 @@ def _provenance(chain: Chain, diagnostics: Diagnostics) -> list[tuple[str, str]]
             ("draws", f"{drawn}acceptance {diagnostics.acceptance:.1%}"),
         ]
     else:
-        efficiency = f"importance efficiency {diagnostics.importance_efficiency:.0%}"
-        how = [("draws", f"{drawn}independent, of the Laplace approximation, {efficiency}")]
+        how = [
+            ("draws", f"{drawn}independent, of the Laplace approximation"),
+            ("approximation", str(diagnostics.approximation)),
+        ]
     return [
         ("chain file", printable(str(chain.path))),
         ("seed", str(chain.seed)),
