@@ -171,6 +171,32 @@ def test_wings_of_the_psf_are_no_companions() -> None:
     assert np.mean([len(each.u) for each in more]) > 2.5
 
 
+def test_tails_that_grow_outward_are_no_companions() -> None:
+    """Stars in the corners have tails of 9 % three widths off; four others have companions.
+
+    With what is common to the brightest stars alone, 260 tails are taken for companions.
+    """
+    lens, half = bf.PolynomialDistortion.polynomial(1), 160.0
+    x, y = (c.ravel() for c in np.mgrid[-half : half + 1 : 14, -half : half + 1 : 14])
+    radius = np.hypot(x, y) / np.hypot(half, half)
+    bright = bf.SourceCatalog(x, y, 5e4 * (1.0 - 0.4 * radius**2))
+    model = bf.ForwardModel(bf.Detector((361, 361), pixel="box"), bright, bf.GaussianPSF(0.8), lens)
+    tails = bf.SourceCatalog(
+        x * (1 + 2.6 / half), y * (1 + 2.6 / half), 0.09 * bright.flux * radius**4
+    )
+    some = np.array([200, 240, 290, 330])
+    others = bf.SourceCatalog(x[some] + 2.6, y[some], np.full(4, 4.5e3))
+    light = sum(
+        replace(model, sources=more).expected_counts(np.zeros(4)) for more in (tails, others)
+    )
+    counts = np.random.default_rng(8).poisson(model.expected_counts(np.zeros(4), 30.0) + light)
+    nuisances = bf.Nuisances("free", psf_sigma=True, footprint=5.0)
+    found = looked(bf.Posterior(model, counts, nuisances=nuisances))
+    distance = np.hypot(found.u[:, None] - others.x, found.v[:, None] - others.y)
+    assert np.all(distance.min(axis=0) < 0.6)
+    assert np.sum(distance.min(axis=1) > 7.0) <= 2  # half a pitch
+
+
 def saturated(seed: int, full: float, *, others: bool) -> tuple[bf.Posterior, Floats]:
     """Moffat images fitted with a Gaussian: two bright stars and 60 whose wings noise hides.
 

@@ -9,8 +9,9 @@ explains.
 A PSF that is not quite right leaves such peaks around bright stars. But they are about the same
 share of the light at the same distance from every star, whereas a source that the catalogue lacks
 stands near one star of many. So near stars a peak has to exceed, too, 2.5 times the share that is
-common: the 75 % quantile of the bright stars'. Where such peaks stand near more than a few stars,
-it is the PSF still, and the share is doubled until they do not.
+common: the 75 % quantile of the bright stars', or that of a star's neighbours in the frame where it
+is larger, for a PSF varies over the field. Where such peaks stand near more than a few stars, it is
+the PSF still, and the share is doubled until they do not.
 
 Light within the filter's reach of masked pixels at a star's image, such as saturated ones, is that
 star's: its wings end at a hole there, and no fainter star shows as much of the PSF's misfit.
@@ -25,6 +26,7 @@ A catalogued source that would keep less than half of its light says little but 
 behind the mask, as bright as can be. It is left out with all of its pixels.
 """
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +42,8 @@ from bayesfred.optimize.peaks import above_ring, vertex
 COMMON = 0.75  # quantile of the bright stars' shares that is the PSF's
 MISFIT = 2.5  # times that
 STARS = 40  # of which it is measured, the brightest third and at least 5
+CLOSE = 4  # filter widths, to which it is measured about every star, too
+ENOUGH = 20  # of a star's neighbours that are not much fainter; STARS of twice as many, at most
 FARTHEST = 8.0  # filter widths from a star to which the PSF's misfit is followed
 TRUNCATED = 4.0  # filter widths at which the filter ends
 RINGS = 2  # a filter width
@@ -117,7 +121,7 @@ def find_uncatalogued(posterior: Posterior, estimate: MapEstimate) -> Uncatalogu
         found = frame.search()
         if frame.near(found) <= max(FEW, MANY * len(frame.flux)):
             break
-        frame.misfit *= 2.0
+        frame.looser *= 2.0
     light = frame.light(found)
     spread = ndimage.maximum_filter(light, 2 * int(np.ceil(0.25 * frame.width)) + 1)
     covered = spread > FAINT * np.sqrt(frame.variance)
@@ -178,7 +182,12 @@ class _Filtered:
         self.square = ndimage.gaussian_laplace(delta, self.width) ** 2
         self.own = self._beside_masked()
         self.sd = self.noise(self.variance)
-        self.misfit = self._misfit(self._excess(np.zeros((0, 3))))
+        self.looser = 1.0
+        self._unexplained = np.maximum(np.abs(self._excess(np.zeros((0, 3)))) - 3.0 * self.sd, 0.0)
+        self._tree = spatial.cKDTree(self.images) if len(self.images) else None
+        self._share = functools.cache(self._share_of)
+        self._common = self._quantile(self._brightest()[:STARS])
+        self.misfit = functools.cache(self._misfit)
 
     def _sharp(self) -> Flags:
         """Pixels that hold light sharper than the stars'."""
@@ -241,23 +250,35 @@ class _Filtered:
         theta = np.zeros(model.distortion.n_terms)
         return replace(model, sources=sources).expected_counts(theta)
 
-    def _misfit(self, excess: Floats) -> Floats:
-        """Share of a star's light that the PSF's misfit leaves, by distance from the star."""
-        rings = int(FARTHEST * RINGS)
-        stars = self._brightest()[:STARS]
-        share = np.zeros((len(stars), rings))
-        more = np.maximum(np.abs(excess) - 3.0 * self.sd, 0.0)  # than noise
-        reach = int(np.ceil(FARTHEST * self.width))
-        for k, (row, column) in enumerate(self.images[stars]):
-            j, i = round(row), round(column)
-            top, left = max(0, j - reach), max(0, i - reach)
-            window = more[top : j + reach + 1, left : i + reach + 1]
-            y, x = np.indices(window.shape)
-            ring = RINGS * np.hypot(y + top - row, x + left - column) / self.width
-            near = ring < rings
-            np.maximum.at(share[k], ring[near].astype(int), window[near])
-            share[k] /= max(self.flux[stars[k]], 1.0)
-        return MISFIT * np.quantile(share, COMMON, axis=0) if len(stars) else np.zeros(rings)
+    def _share_of(self, star: int) -> Floats:
+        """Share of a star's light that the model leaves beside noise, by distance from the star."""
+        row, column = self.images[star]
+        j, i, reach = round(row), round(column), int(np.ceil(FARTHEST * self.width))
+        top, left = max(0, j - reach), max(0, i - reach)
+        window = self._unexplained[top : j + reach + 1, left : i + reach + 1]
+        y, x = np.indices(window.shape)
+        ring = RINGS * np.hypot(y + top - row, x + left - column) / self.width
+        share = np.zeros(int(FARTHEST * RINGS))
+        near = ring < share.size
+        np.maximum.at(share, ring[near].astype(int), window[near])
+        return np.asarray(share / max(self.flux[star], 1.0))
+
+    def _quantile(self, stars: Ints) -> Floats:
+        shares = [self._share(int(star)) for star in stars] or [np.zeros(int(FARTHEST * RINGS))]
+        return MISFIT * np.quantile(shares, COMMON, axis=0)
+
+    def _misfit(self, star: int) -> Floats:
+        """The share that is the PSF's, at a star or at another light that was found."""
+        if self._tree is None or star >= len(self.images):
+            return self._common
+        nearest = self._tree.query(self.images[star], 2 * STARS + 1)[1][1:]
+        nearest = nearest[nearest < len(self.images)]
+        alike = nearest[self.flux[nearest] >= LEFT * self.flux[star]]
+        if len(alike) < ENOUGH:
+            return self._common
+        around = self._quantile(alike[:STARS])
+        around[CLOSE * RINGS :] = 0.0  # farther out it is others' light by chance
+        return np.maximum(self._common, around)
 
     def without_hidden(self, kept: Flags) -> tuple[Flags, Ints]:
         """A mask without the sources that keep too little of their light, and their rows."""
@@ -289,10 +310,10 @@ class _Filtered:
 
     def near(self, found: Floats) -> int:
         """How many of these stand on pixels in use and within the reach of a star's misfit."""
-        if not len(self.images):
+        if self._tree is None:
             return 0
         row, column = np.clip(np.rint(found[:, :2]).astype(int), 0, np.array(self.sd.shape) - 1).T
-        distance, _ = spatial.cKDTree(self.images).query(found[:, :2])
+        distance, _ = self._tree.query(found[:, :2])
         used = self.posterior.mask[row, column]
         return int(np.sum(used & (distance < FARTHEST * self.width)))
 
@@ -312,8 +333,9 @@ class _Filtered:
             near = spatial.cKDTree(lights).query_ball_point(places, FARTHEST * self.width)
             for k, some in enumerate(near):
                 distance = np.hypot(*(lights[some] - places[k]).T) / self.width
-                ring = np.minimum((RINGS * distance).astype(int), len(self.misfit) - 1)
-                above[k] -= np.sum(fluxes[some] * self.misfit[ring])
+                ring = np.minimum((RINGS * distance).astype(int), self._common.size - 1)
+                shares = [self.misfit(i)[r] for i, r in zip(some, ring, strict=True)]
+                above[k] -= self.looser * np.sum(fluxes[some] * shares)
                 if np.any(distance < 1.0):  # a star of another brightness or width
                     above[k] = -np.inf
         row, column = row[above > 0.0], column[above > 0.0]

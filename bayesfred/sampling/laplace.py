@@ -186,8 +186,8 @@ class ApproximationCheck(NamedTuple):
         if self.efficiency >= MIN_EFFICIENCY or np.isnan(self.shift):
             return said
         return (
-            f"{said}, the posterior's mean {self.shift:.2g} standard deviations off, its errors "
-            f"at worst {self.widening:.3g} times as large"
+            f"{said}, the posterior's mean {self.shift:.1f} standard deviations off, its errors "
+            f"at worst {self.widening:.2f} times as large"
         )
 
 
