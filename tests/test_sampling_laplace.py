@@ -202,6 +202,22 @@ def test_the_check_takes_few_draws_where_these_tell(
     assert fewest <= np.mean(numbers) <= most
 
 
+def test_the_check_of_many_parameters_takes_few_draws_where_moments_tell(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With an efficiency of 0.80, which 256 draws cannot tell from the bound."""
+    numbers: list[int] = []
+
+    def counted(density: Other, params: Floats) -> Any:
+        numbers.append(len(params))
+        return Normal.log_prob(density, params - density.mean)
+
+    monkeypatch.setattr(Other, "log_prob", counted)
+    found = checks(off_by(0.011))
+    assert all(check.holds for check in found)
+    assert 64 <= sum(numbers) / len(found) < 180
+
+
 def test_the_check_of_few_draws_evaluates_each_once() -> None:
     evaluated: list[int] = []
     chain = drawn_with(0.9, 0, evaluated)

@@ -46,7 +46,7 @@ MAX_SHIFT = 0.5  # standard deviations: the same, found rather than bounded
 MAX_WIDENING = 1.25
 # Numbers of draws at which the posterior is evaluated, one after the other until they tell that the
 # approximation holds, by two standard deviations: of all it would take minutes.
-WEIGHTED = 16, 64, 256
+WEIGHTED = 16, 64, 128, 256
 HOPELESS = 0.1  # efficiency below which these tell nothing
 
 
@@ -239,20 +239,24 @@ def check_approximation(chain: Chain) -> ApproximationCheck:
     chain = chain.whole or chain
     draws, log_q = chain.chain.reshape(-1, len(chain.parameter_names)), chain.log_prob.ravel()
     log_weights = np.empty(0)
-    for number in WEIGHTED:  # the draws are independent, so the first ones are as good as any
-        more = slice(log_weights.size, number)
-        log_p = chain.density.log_prob(draws[more])
-        log_weights = np.append(log_weights, log_p - log_q[more])
-        weights = _weights(log_weights)
-        efficiency, sd = _efficiency(weights)
-        # a few draws may have missed large weights
-        is_known = efficiency - 2.0 * sd > MIN_EFFICIENCY and number > WEIGHTED[0]
-        if is_known or efficiency + 2.0 * sd < HOPELESS or log_weights.size == len(draws):
-            break
-    if efficiency < HOPELESS or len(draws) < 2 * draws.shape[1]:
-        return ApproximationCheck(efficiency, np.nan, np.nan)
+    enough = len(draws) >= 2 * draws.shape[1]
     with one_blas_thread():
-        return ApproximationCheck(efficiency, *_moments(weights, draws))
+        standard = _standardised(draws) if enough else None
+        for number in WEIGHTED:  # the draws are independent, so the first ones are as good as any
+            more = slice(log_weights.size, number)
+            log_p = chain.density.log_prob(draws[more])
+            log_weights = np.append(log_weights, log_p - log_q[more])
+            weights = _weights(log_weights)
+            efficiency, sd = _efficiency(weights)
+            found = None if standard is None else _moments(weights, *standard)
+            holds = efficiency - 2.0 * sd > MIN_EFFICIENCY or (found and found.surely_hold)
+            # a few draws may have missed large weights
+            is_known = holds and number > WEIGHTED[0]
+            if is_known or efficiency + 2.0 * sd < HOPELESS or log_weights.size == len(draws):
+                break
+    if efficiency < HOPELESS or found is None:
+        return ApproximationCheck(efficiency, np.nan, np.nan)
+    return ApproximationCheck(efficiency, found.shift, found.widening)
 
 
 def _weights(log_weights: Floats) -> Floats:
@@ -273,16 +277,56 @@ def _efficiency(weights: Floats) -> tuple[float, float]:
     return float(1.0 / square), float(spread / square**2)
 
 
-def _moments(weights: Floats, draws: Floats) -> tuple[float, float]:
-    """Shift and widening, see `ApproximationCheck`, by the weights of the first of all draws."""
-    n, excess = weights.size, weights - 1.0
+class _Moments(NamedTuple):
+    """What weights tell of the posterior's mean and variances, beside those of the draws.
+
+    Attributes
+    ----------
+    square, square_sd : float
+        The mean's squared distance, without bias, and its standard deviation where it is zero.
+    change, change_sd : ndarray, shape (d,)
+        Every parameter's variance over that of the draws, less 1.
+    """
+
+    square: float
+    square_sd: float
+    change: Floats
+    change_sd: Floats
+
+    @property
+    def shift(self) -> float:
+        return float(np.sqrt(max(self.square, 0.0)))
+
+    @property
+    def widening(self) -> float:
+        beyond = np.maximum(np.abs(self.change) - 2.0 * self.change_sd, 0.0)
+        ratio = np.sqrt(np.maximum(1.0 + np.sign(self.change) * beyond, 0.0))
+        return float(ratio[np.argmax(np.maximum(ratio, 1.0 / np.maximum(ratio, 1e-9)))])
+
+    @property
+    def surely_hold(self) -> bool:
+        """Whether both are within their bounds by two standard deviations."""
+        near = max(self.square, 0.0) + 2.0 * self.square_sd <= MAX_SHIFT**2
+        narrow = self.change - 2.0 * self.change_sd >= MAX_WIDENING**-2 - 1.0
+        wide = self.change + 2.0 * self.change_sd <= MAX_WIDENING**2 - 1.0
+        return bool(near and np.all(narrow & wide))
+
+
+def _standardised(draws: Floats) -> tuple[Floats, Floats]:
+    """Draws whose variances are 1, and such that their covariance is the identity."""
     z = (draws - draws.mean(axis=0)) / draws.std(axis=0)
-    white = np.linalg.qr(z)[0][:n] * np.sqrt(len(z))  # Q^T Q = 1
-    mean = excess @ white
-    square = mean @ mean - excess**2 @ np.sum(white**2, axis=1)  # the pairs of different draws
+    return z, np.linalg.qr(z)[0] * np.sqrt(len(z))  # Q^T Q = 1
+
+
+def _moments(weights: Floats, z: Floats, white: Floats) -> _Moments:
+    """By the weights of the first of all draws."""
+    n, excess = weights.size, weights - 1.0
+    mean = excess @ white[:n]
+    pairs = mean @ mean - excess**2 @ np.sum(white[:n] ** 2, axis=1)  # of different draws
     changes = excess[:, None] * (z[:n] ** 2 - 1.0)
-    error = 2.0 * changes.std(axis=0) / np.sqrt(n)
-    change = changes.mean(axis=0) - (excess @ z[:n] / n) ** 2
-    ratio = np.sqrt(np.maximum(1.0 + np.sign(change) * np.maximum(np.abs(change) - error, 0.0), 0))
-    farthest = np.argmax(np.maximum(ratio, 1.0 / np.maximum(ratio, 1e-9)))
-    return float(np.sqrt(max(square, 0.0) / (n * (n - 1)))), float(ratio[farthest])
+    return _Moments(
+        square=float(pairs / (n * (n - 1))),
+        square_sd=float((2.0 * z.shape[1]) ** 0.5 * np.mean(excess**2) / n),
+        change=changes.mean(axis=0) - (excess @ z[:n] / n) ** 2,
+        change_sd=changes.std(axis=0) / np.sqrt(n),
+    )
