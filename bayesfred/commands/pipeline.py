@@ -42,6 +42,7 @@ from bayesfred.optimize.local_background import background_message, subtract_bac
 from bayesfred.optimize.measure_psf import marginalize_psf, measure_psf, psf_message
 from bayesfred.optimize.outliers import BREAKDOWN, share_lost
 from bayesfred.optimize.uncatalogued import find_uncatalogued
+from bayesfred.optimize.wings import wings_outside
 from bayesfred.sampling.progress import working
 from bayesfred.sources import bright, find_sources
 
@@ -270,6 +271,9 @@ def _follow(
         "near to the catalogue's positions"
     ]
     estimate = approach(followed, near)[1] if rough else find_map(followed)
+    wings = wings_outside(followed, estimate.params)
+    if wings is not None:
+        lines.append(f"footprints: {wings.sentence}: {wings.remedy}")
     if scale is not None:
         even = subtract_background(followed, estimate, scale)
         light = followed.counts - even.counts
@@ -280,7 +284,7 @@ def _follow(
             f"outside the footprints at every {scale:g} pixels, subtracted"
         )
         followed = even
-    else:
+    elif wings is None:
         lines.append(background_message(followed, estimate.params))
     found = find_uncatalogued(followed, estimate)
     if lost := int(np.sum(followed.mask & ~found.mask)):

@@ -14,6 +14,8 @@ near zero for a true model, and a cause explains the part of E that would go wit
   exp(-e^2 / 4 s^2)), with the PSF's width s and its squared signal to noise: q where the model has
   light that is not there, q' where there is light that the model does not have;
 - pixels or sources that are to be left out explain what they hold, less what their like hold;
+- a background that is uneven explains what the mean counts of its parts do; wings of the sources do
+  in its place where those outside the footprints fall off from the images, as the fluxes have it;
 - another PSF explains what all sources have in common, in proportion to their flux, and companions
   that no catalogue has the best peak beside each source in what is left.
 

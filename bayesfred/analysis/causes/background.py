@@ -1,4 +1,4 @@
-"""The hypothesis that the background is not the polynomial that was fitted."""
+"""The hypotheses that the background is not the polynomial that was fitted, or no background."""
 
 import math
 from collections.abc import Iterator
@@ -11,9 +11,19 @@ from bayesfred.analysis.causes.context import Context
 from bayesfred.model.kernels.contexts import BACKGROUND_POWERS, MOST_ORDER
 from bayesfred.model.noise import SubtractedNoise
 from bayesfred.optimize.local_background import structure_outside
+from bayesfred.optimize.wings import wings_outside
 
 NOTICEABLE = 5.0  # standard deviations
 TILES_A_TERM = 2  # at least, for a polynomial to be tried
+
+
+def wings(context: Context) -> Finding | None:
+    """Light of the sources outside their footprints, which is taken for background within them."""
+    found = wings_outside(context.posterior, context.params)
+    if found is None:
+        return None
+    cause = Cause("wings", 0.0, found.sentence, found.remedy)
+    return Finding(cause, min(found.squares, abs(context.excess)), "background")
 
 
 def background_between(
@@ -29,7 +39,7 @@ def background_between(
     by = float((excess * np.median(context.variance[context.used])) ** 0.5)
     mending = _mending_order(context.posterior.nuisances.background_order, tiles, ratio)
     cause = _uneven(context, "between the sources", by, mending)
-    yield Finding(cause, held * everywhere, "background")
+    yield Finding(cause, min(held * everywhere, abs(context.excess)), "background")
 
 
 def background_outside(context: Context) -> Iterator[Finding]:

@@ -20,9 +20,9 @@ class Cause:
     ----------
     name : str
         One of "saturation", "alternating pixels", "rows or columns", "correlated pixels",
-        "gain", "read noise", "pedestal", "over-dispersion", "background", "unmatched", "origin",
-        "parity", "shift", "rotation or scale", "missing terms", "wrong sources", "positions",
-        "uncatalogued sources", "companions", "fluxes" and "PSF".
+        "gain", "read noise", "pedestal", "over-dispersion", "background", "wings", "unmatched",
+        "origin", "parity", "shift", "rotation or scale", "missing terms", "wrong sources",
+        "positions", "uncatalogued sources", "companions", "fluxes" and "PSF".
     share : float
         Part of the misfit that it explains, from 0 to 1; 1 also where nothing can be judged.
     sentence : str

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from bayesfred._typing import Floats
+from bayesfred.analysis.causes.background import wings
 from bayesfred.analysis.causes.cause import Cause, Finding
 from bayesfred.analysis.causes.context import Context
 from bayesfred.analysis.causes.light import companions, fluxes, psf, single_sources
@@ -62,7 +63,7 @@ def find_causes(
             findings += found
     if context.light.matched.any() or context.bright.any():
         place = placement(context)
-        findings += [place, *background_and_noise(context)]
+        findings += [place, wings(context), *background_and_noise(context)]
         if place is None or place.cause.name != "unmatched":
             findings += [fluxes(context), psf(context), companions(context), scatter(context)]
             findings += single_sources(context, place)
