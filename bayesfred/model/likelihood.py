@@ -32,7 +32,7 @@ from bayesfred.model.kernels.contexts import (
 )
 from bayesfred.model.kernels.evaluate import log_likelihoods, render
 from bayesfred.model.kernels.fisher import fisher
-from bayesfred.model.kernels.gradient import gradient
+from bayesfred.model.kernels.gradient import from_sources, gradient, room_for
 from bayesfred.model.kernels.likelihood import clear, new_workspace
 from bayesfred.model.kernels.sources import OwnPixels, own_pixels
 from bayesfred.model.near_mean import Around, problem_near
@@ -132,7 +132,7 @@ class FrameLikelihood:
         if not self._free:
             slow = not self.noise.discrete and hasattr(self._frame.noise, "near")
             return self._with(Around(params, covariance)) if slow else self
-        out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
+        out = room_for(len(self.model.sources), self._basis), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
             _, nearby = gradient(self._problem, w, rendered, parameters, self._basis, out)
         known = extrapolate(self.model, self._found, rendered, nearby, (params, covariance))
@@ -154,14 +154,19 @@ class FrameLikelihood:
         varies, frame = self.nuisances.background_order > 0, other._frame
         vars(self)["_frame"] = frame._replace(varies=varies, everywhere=varies or frame.everywhere)
 
+    def slopes(self, params: Floats, basis: Basis) -> tuple[Floats, Floats]:
+        """Every source's part of the derivatives, and those by `SCALES` and the background."""
+        out = room_for(len(self.model.sources), basis), np.zeros(len(BACKGROUND_TERMS))
+        with self._rendered(params) as (w, rendered, parameters):
+            scales, _ = gradient(self._problem, w, rendered, parameters, basis, out)
+        return out[0], np.append(scales, out[1])
+
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
-        out = np.zeros(self._basis.row.size), np.zeros(len(BACKGROUND_TERMS))
-        with self._rendered(params) as (w, rendered, parameters):
-            slopes, _ = gradient(self._problem, w, rendered, parameters, self._basis, out)
-        if np.isnan(slopes[0]):
+        parts, others = self.slopes(params, self._basis)
+        if np.isnan(others[0]):
             return np.full(len(self.parameters), np.nan)
-        found = np.concatenate([out[0], slopes, out[1]]) @ self._chain_rule(params)
+        found = np.append(from_sources(self._basis, parts), others) @ self._chain_rule(params)
         if self.occam:
             found[self._error] += self.occam.slope(params[self._error])
         return np.asarray(found)

@@ -4,10 +4,9 @@ A catalogue's position enters the likelihood like a coefficient of the distortio
 
     da/dx = -1 + f_x(u, v, x, y),    db/dx = g_x(u, v, x, y),
 
-polynomials in u and v whose monomials are those of f and g. The compiled gradient is a sum over
-sources of factors times sums over a source's own pixels, a sum for every monomial. With a factor of
-one for one source and one monomial, and zero for the others, it gives these sums one by one, and
-with them the exact derivatives by all parameters and positions.
+polynomials in u and v whose monomials are those of f and g. The compiled gradient has a sum over
+every source's own pixels for every monomial, which make the exact derivatives by all parameters and
+positions.
 
 The information is that of the sources' templates (`kernels.sources`): light S, its derivatives X
 and Y along a and b, and dS/dln(sigma). A change of a parameter or a position changes the
@@ -18,7 +17,6 @@ T^T w T couples sources that share pixels, and no others, so everything is spars
 """
 
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -28,11 +26,9 @@ from scipy.sparse.linalg import splu
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.catalog import SourceCatalog
 from bayesfred.imaging.inverse import slopes
-from bayesfred.imaging.kernels.contexts import Basis
 from bayesfred.model.kernels.contexts import BACKGROUND_POWERS
-from bayesfred.model.kernels.gradient import gradient
+from bayesfred.model.kernels.gradient import from_sources
 from bayesfred.model.likelihood import FrameLikelihood
-from bayesfred.model.parameters import BACKGROUND_TERMS
 
 WIDTHS = 4.0  # radius of the pixels that tell of a source, in widths of the PSF
 REACH = 0.75  # pixel, added so that the pixel of the image's middle is always among them
@@ -96,18 +92,14 @@ class MovableLikelihood(FrameLikelihood):
         """
         s, field = self.model.sources, self.model.polynomial
         whole = self.model.basis(("offset_x", "offset_y", *self._moving))
-        rows, where = np.unique(whole.row, return_inverse=True)
-        each = Basis(whole.f, whole.g, np.tile(rows, len(s)), _one_by_one(len(s), rows.size))
-        found, background = np.zeros(each.row.size), np.zeros(len(BACKGROUND_TERMS))
-        with self._rendered(params) as (w, rendered, parameters):
-            slope, _ = gradient(self._problem, w, rendered, parameters, each, (found, background))
-        if np.isnan(slope[0]):
+        parts, others = self.slopes(params, whole)
+        if np.isnan(others[0]):
             return np.full(params.size, np.nan), np.full((len(s), 2), np.nan)
-        sums = found.reshape(len(s), rows.size)[:, where]  # (s, what `whole` derives by)
+        sums = parts[:, whole.row]
         terms = np.array([*field.f_terms, *field.g_terms])[:, :2]
-        kept = [*range(len(terms)), *range(len(terms) + 2, where.size)]  # all but the offsets
-        by = (sums * whole.factors).sum(axis=0)[kept]
-        by_params = np.concatenate([by, slope, background]) @ self._chain_rule(params)
+        kept = [*range(len(terms)), *range(len(terms) + 2, whole.row.size)]  # all but the offsets
+        by = from_sources(whole, parts)[kept]
+        by_params = np.append(by, others) @ self._chain_rule(params)
         theta = field.monomial_coefficients(params[: field.n_terms])
         by_position = sums[:, len(terms) : len(terms) + 2] * -1.0
         for axis in (0, 1):
@@ -208,12 +200,6 @@ class MovableLikelihood(FrameLikelihood):
         v, u = np.arange(1 - ny, ny, 2)[:, None] / ny, np.arange(1 - nx, nx, 2) / nx
         powers = BACKGROUND_POWERS[: len(self.nuisances.background_names)]
         return np.stack([(u**m * v**n).ravel() for m, n in powers], axis=1)
-
-
-@lru_cache(maxsize=4)
-def _one_by_one(sources: int, rows: int) -> Floats:
-    """Factors that pick a source and one of its rows, shape (s, s rows)."""
-    return np.ascontiguousarray(np.kron(np.eye(sources), np.ones(rows)))
 
 
 def _power_slopes(powers: Ints, at: tuple[Floats, Floats], axis: int) -> Floats:

@@ -25,12 +25,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.linalg import LinAlgError, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 from scipy.special import logsumexp
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
+from bayesfred.model.observed import displacing_parameters, observed_information
 from bayesfred.model.parameters import SCALES
+from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, inverse
 
@@ -88,12 +90,13 @@ def approximations(
                 for j, name in enumerate(posterior.parameter_names)
                 if name in SCALES and name not in posterior.hyperparameters
             ]
+        known = _observed(posterior, mean) if posterior.hyperparameters or scales else None
         if posterior.hyperparameters and k < modes.count:
             width = 0.5 if standing_for_it else 1.0
-            means, covariances, weights = _nested(posterior, mean, covariance, scales, width)
+            means, covariances, weights = _nested(posterior, mean, covariance, scales, width, known)
         else:
             if scales:
-                mean, covariance, _ = _given(posterior, mean, covariance, scales)
+                mean, covariance, _ = _given(posterior, mean, covariance, scales, None, known)
             elif outside:
                 mean = mean + covariance @ posterior.gradient(mean)
             means, covariances, weights = mean[None], covariance[None], np.ones(1)
@@ -116,6 +119,7 @@ def _given(
     covariance: Floats,
     scales: list[_Scale],
     j: int | None = None,
+    observed: Floats | None = None,
 ) -> tuple[Floats, Floats, float]:
     """The Laplace approximation of all parameters, or of those but the j-th, given that.
 
@@ -131,6 +135,8 @@ def _given(
         at += scale.shift * slopes / np.sqrt(slopes[scale.parameter])
     found, gradient = np.zeros(covariance.shape), posterior.gradient(at)
     found[np.ix_(free, free)] = inverse(posterior.information(at)[np.ix_(free, free)])
+    if observed is not None:
+        found = observed @ found @ observed.T
     gradient[[scale.parameter for scale in scales]] = 0.0
     mean = np.clip(at + found @ gradient, *posterior.support)
     value = float(posterior.log_prob(mean))
@@ -141,6 +147,27 @@ def _given(
         slopes = found[:, scale.parameter] / np.sqrt(found[scale.parameter, scale.parameter])
         found += (scale.widening - 1.0) * np.outer(slopes, slopes)
     return mean, found, value
+
+
+def _observed(posterior: TargetDensity, params: Floats) -> Floats | None:
+    """What turns the errors by the Fisher information into those by the observed one, (d, d).
+
+    It changes the parameters that displace images; None where these are none, or the two differ by
+    so much that the posterior is not normal.
+    """
+    which = displacing_parameters(posterior) if isinstance(posterior, Posterior) else ()
+    if not len(which) or not isinstance(posterior, Posterior):
+        return None
+    expected = posterior.information(params)
+    root = cholesky(inverse(expected[np.ix_(which, which)]), lower=True)
+    relative = root.T @ observed_information(posterior, params, expected) @ root
+    values, vectors = eigh(relative, check_finite=False)
+    if not np.all((values > WIDEST**-2) & (values < WIDEST**2)):
+        return None
+    change = root @ (vectors / np.sqrt(values)) @ vectors.T
+    out = np.eye(params.size)
+    out[np.ix_(which, which)] = solve_triangular(root, change.T, lower=True, trans=1).T
+    return out
 
 
 def _widened(posterior: TargetDensity, mean: Floats, covariance: Floats, value: float) -> Floats:
@@ -182,7 +209,10 @@ def _marginal(posterior: TargetDensity, params: Floats, covariance: Floats, j: i
     for value in (params[j] - step, params[j], params[j] + step):
         at = params.copy()
         at[j] = value
-        _, given, log_prob = _given(posterior, at, covariance, [], j)
+        try:
+            _, given, log_prob = _given(posterior, at, covariance, [], j)
+        except (LinAlgError, ValueError):  # no density there
+            return _Scale(j)
         given[j, j] = 1.0
         logs.append(log_prob + 0.5 * np.linalg.slogdet(given)[1])
     below, top, above = logs
@@ -198,6 +228,7 @@ def _nested(
     covariance: Floats,
     scales: list[_Scale],
     width: float,
+    observed: Floats | None,
 ) -> tuple[Floats, Floats, Floats]:
     """Means, covariances and weights of approximations nested on the hyperparameter.
 
@@ -212,13 +243,13 @@ def _nested(
         at[j] *= np.exp(k * ratio)
         if not low[j] <= at[j] <= high[j]:
             return -np.inf
-        mean, given, value = _given(posterior, at, covariance, scales, j)
-        given[j, j] = (ratio * mean[j] * width) ** 2
-        log = value + 0.5 * float(np.linalg.slogdet(given)[1])
         try:
+            mean, given, value = _given(posterior, at, covariance, scales, j, observed)
+            given[j, j] = (ratio * mean[j] * width) ** 2
             lower = cholesky(given, lower=True)
-        except (LinAlgError, ValueError):
+        except (LinAlgError, ValueError):  # no density there
             return -np.inf
+        log = value + 0.5 * float(np.linalg.slogdet(given)[1])
         if np.isfinite(log):
             known[k] = mean, lower, log
         return log

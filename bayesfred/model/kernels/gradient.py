@@ -42,7 +42,7 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.kernels.compilation import entry, inner, leaf
-from bayesfred.imaging.kernels.contexts import SEGMENT
+from bayesfred.imaging.kernels.contexts import SEGMENT, Basis
 from bayesfred.imaging.kernels.geometry import layout_of, row_starts
 from bayesfred.imaging.kernels.sums import add_basis_sums, new_sums
 from bayesfred.model.kernels.contexts import LIMIT, Nearby
@@ -175,22 +175,34 @@ def _fill_weights(w, fp, a, s, t, out):
 
 @leaf()
 def _add_sources(layout, basis, w, amplitudes, buffers, out):
-    """Add the sums over all sources' pixels to the gradient."""
+    """Add the sums over every source's pixels to its row."""
     sums, weights = buffers
     for s in range(amplitudes.fluxes.size):
         sums.out[:] = 0.0
         for t in range(amplitudes.z.shape[1]):
             _fill_weights(w, layout.footprints, amplitudes, s, t, weights)
             add_basis_sums(layout, basis, s, t, weights, sums)
-        for k in range(basis.row.size):
-            out[k] += basis.factors[s, k] * sums.out[basis.row[k]]
+        for k in range(sums.out.size):
+            out[s, k] += sums.out[k]
+
+
+def room_for(sources: int, basis: Basis) -> Floats:
+    """What the sources' parts of the derivatives go into, shape (sources, rows of the basis)."""
+    return np.zeros((sources, len(basis.f) + len(basis.g) + 2))
+
+
+def from_sources(basis: Basis, parts: Floats) -> Floats:
+    """The derivatives with respect to the source parameters, from those of `room_for`."""
+    terms = (f @ parts[:, row] for f, row in zip(basis.factors.T, basis.row, strict=True))
+    return np.fromiter(terms, np.float64, basis.row.size)
 
 
 @entry()
 def gradient(problem, w, rendered, parameters, basis, out):
     """Exact gradient of the log-likelihood.
 
-    `out` are two arrays: for the source parameters and the background coefficients. Returns the
+    `out` are two arrays: for every source's part of the derivatives with respect to the basis, see
+    `from_sources`, and for those with respect to the background coefficients. Returns the
     derivatives with respect to position_scatter and model_error, NaN where the likelihood is zero,
     and what helps to search nearby.
     """

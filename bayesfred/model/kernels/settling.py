@@ -155,9 +155,9 @@ def maximize(frame, parameters, cluster, known, h):
     settles = cluster.touching.stamps.shape[0] > 1 and known.nearby.e.size == 0
     for _ in range(ROUNDS if settles and members.size > 1 else 0):
         gain = search(frame, parameters, cluster, known, h, (distances, few))
-        if gain < math.inf or math.isnan(gain):
+        if gain < math.inf:
             return gain
         for i in range(members.size):
-            if distances[i] > CLOSE:
+            if not abs(distances[i]) <= CLOSE:
                 settle(frame, parameters, alone(cluster, i), own)
     return search(frame, parameters, cluster, known, h, (distances, 0))

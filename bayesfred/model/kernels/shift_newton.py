@@ -50,6 +50,7 @@ VAGUE = 0.2  # of a change of log det H, since e depends on the parameters
 PATIENT, HALVES = 10, 8  # visits before steps are only taken uphill; how often one is halved
 CERTAIN = 0.01  # square of the distance from which on they are anyway
 ENDLESS, FLAT = 60, 1e-3  # visits after which so small a square of the distance will do
+AS_ONE = 100  # visits after which all sources take the same share of a step, uphill
 MOST_VISITS = 200  # of all pixels in a search
 VISITS = 8  # after which one does not end early
 ENOUGH = 3e-6  # error of the log-likelihood for every source, with which a search ends early
@@ -333,7 +334,8 @@ def search(frame, parameters, cluster, known, h, left):
         for i in range(shares.size):
             own = slice(i * size, (i + 1) * size)
             distances[i] = np.dot(gradient[own], step[own])
-        if exact:
+        # shares of single sources may make a step that leads downhill; a common one never does
+        if exact or visit >= AS_ONE or np.dot(shares, distances) <= 0.0:
             shares[:] = 1.0
         if early and fresh:
             width = _change_of_width(cluster, known.nearby, shares, step)
@@ -346,7 +348,7 @@ def search(frame, parameters, cluster, known, h, left):
         # templates follow by second derivatives that are right only about: steps must get shorter
         still = 0.0 if rate > 0.1 else (STILL_EARLY if early else STILL)
         take_step(cluster, step, shares, exact, still)
-        if visit >= PATIENT and size > 1 and distance > CERTAIN:
+        if visit >= PATIENT and size > 1 and distance > (CERTAIN if visit < AS_ONE else FLAT):
             way = step, shares
             value = turn_back(frame, parameters, cluster, way, value)
         if visit > ENDLESS and size > 1 and distance <= FLAT:
