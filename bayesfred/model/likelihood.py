@@ -132,11 +132,8 @@ class FrameLikelihood:
         if not self._free:
             slow = not self.noise.discrete and hasattr(self._frame.noise, "near")
             return self._with(Around(params, covariance)) if slow else self
-        out = room_for(len(self.model.sources), self._basis), np.zeros(len(BACKGROUND_TERMS))
-        with self._rendered(params) as (w, rendered, parameters):
-            _, nearby = gradient(self._problem, w, rendered, parameters, self._basis, out)
-        known = extrapolate(self.model, self._found, rendered, nearby, (params, covariance))
-        return self._with(known)
+        known = *self.slopes(params, self._basis)[2:], (params, covariance)
+        return self._with(extrapolate(self.model, self._found, *known))
 
     def _with(self, extrapolation: Extrapolation | Around | None) -> "FrameLikelihood":
         close = replace(self, extrapolation=extrapolation)
@@ -154,16 +151,16 @@ class FrameLikelihood:
         varies, frame = self.nuisances.background_order > 0, other._frame
         vars(self)["_frame"] = frame._replace(varies=varies, everywhere=varies or frame.everywhere)
 
-    def slopes(self, params: Floats, basis: Basis) -> tuple[Floats, Floats]:
+    def slopes(self, params: Floats, basis: Basis) -> tuple[Floats, Floats, Any, Any]:
         """Every source's part of the derivatives, and those by `SCALES` and the background."""
         out = room_for(len(self.model.sources), basis), np.zeros(len(BACKGROUND_TERMS))
         with self._rendered(params) as (w, rendered, parameters):
-            scales, _ = gradient(self._problem, w, rendered, parameters, basis, out)
-        return out[0], np.append(scales, out[1])
+            scales, nearby = gradient(self._problem, w, rendered, parameters, basis, out)
+        return out[0], np.append(scales, out[1]), rendered, nearby
 
     def gradient(self, params: Floats) -> Floats:
         """Exact gradient of the log-likelihood, shape (d,); NaN where that is -inf."""
-        parts, others = self.slopes(params, self._basis)
+        parts, others, *_ = self.slopes(params, self._basis)
         if np.isnan(others[0]):
             return np.full(len(self.parameters), np.nan)
         found = np.append(from_sources(self._basis, parts), others) @ self._chain_rule(params)
@@ -256,9 +253,7 @@ class FrameLikelihood:
     def simulate(
         self, params: Floats, rng: np.random.Generator, fluxes: Floats | None = None
     ) -> Floats | None:
-        """Draw a frame given the parameters, and the sources' shifts from their prior.
-
-        Free fluxes are drawn from theirs unless they are given, shape (s,).
+        """Draw a frame given the parameters; shifts, and fluxes if not given, from their prior.
 
         Returns
         -------

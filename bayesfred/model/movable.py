@@ -92,7 +92,7 @@ class MovableLikelihood(FrameLikelihood):
         """
         s, field = self.model.sources, self.model.polynomial
         whole = self.model.basis(("offset_x", "offset_y", *self._moving))
-        parts, others = self.slopes(params, whole)
+        parts, others, *_ = self.slopes(params, whole)
         if np.isnan(others[0]):
             return np.full(params.size, np.nan), np.full((len(s), 2), np.nan)
         sums = parts[:, whole.row]

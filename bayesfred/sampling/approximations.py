@@ -13,8 +13,9 @@ others. The k-th weight is proportional to the posterior there times the root of
 the covariance.
 
 A scale without a nested approximation, such as the model error, has its mean and variance in every
-part from the marginal density at three of its values. Where there are scales the posterior may be
-wider than its information says, in all directions: see `_widened`.
+part from the marginal density at three of its values. Where there are scales the curvature of the
+posterior is not its Fisher information. About what displaces images it is the observed one, see
+`model.observed`, and what is left in all directions alike is in `_widened`.
 
 References
 ----------
