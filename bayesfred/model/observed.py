@@ -22,78 +22,69 @@ import numpy as np
 
 from bayesfred._typing import Floats, Ints
 from bayesfred.imaging.monomials import U, V
-from bayesfred.model.posterior import Posterior
+from bayesfred.model.likelihood import FrameLikelihood
 
 
-def displacing_parameters(posterior: Posterior) -> Ints:
+def displacing_parameters(likelihood: FrameLikelihood) -> Ints:
     """The parameters whose observed information can be told; none where f and g move with u and v.
 
     Parameters
     ----------
-    posterior : Posterior
+    likelihood : FrameLikelihood
 
     Returns
     -------
     ndarray of int
     """
-    field, parameters = posterior.model.polynomial, posterior.parameters
+    field, parameters = likelihood.model.polynomial, likelihood.parameters
     whole = all(t[U] == t[V] == 0 for t in (*field.f_terms, *field.g_terms))
-    if not (whole and posterior.nuisances.offset):
-        return np.empty(0, int)
-    return np.array(
-        [
-            k
-            for k, each in enumerate(parameters)
-            if each.kind == "distortion" or each.name.startswith("offset")
-        ]
-    )
+    if not (whole and likelihood.nuisances.offset):
+        return np.empty(0, np.int64)
+    moving = (each.kind == "distortion" or each.name.startswith("offset") for each in parameters)
+    return np.flatnonzero(list(moving))
 
 
-def observed_information(posterior: Posterior, params: Floats, information: Floats) -> Floats:
-    """The information, with the observed one about the parameters that displace images.
+def observed_information(likelihood: FrameLikelihood, params: Floats, covariance: Floats) -> Floats:
+    """The observed information of the likelihood about the `displacing_parameters`.
 
     Parameters
     ----------
-    posterior : Posterior
-        Of which `displacing_parameters` names some.
+    likelihood : FrameLikelihood
+        Which has some.
     params : ndarray, shape (d,)
-        Where it has a density.
-    information : ndarray, shape (d, d)
-        There, expected.
+        Where it is not zero.
+    covariance : ndarray, shape (k, k)
+        Of these parameters, the others known: as far apart as draws from it displace the sources
+        the slopes are taken.
 
     Returns
     -------
     ndarray, shape (k, k)
-        About these parameters alone, the others known, with the curvature of the prior.
     """
-    which, likelihood = displacing_parameters(posterior), posterior.likelihood
-    moves = _moves(posterior)[:, :, which]
-    prior = posterior.prior_information(params)[np.ix_(which, which)]
-    covariance = np.linalg.inv(information[np.ix_(which, which)])
-    # as far apart as draws displace the sources
-    typical = np.sqrt(np.einsum("asj,jk,ask->a", moves, covariance, moves) / moves.shape[1])
-    basis = posterior.model.basis(("offset_x", "offset_y"))
-    curvature = np.empty((len(posterior.model.sources), 2, 2))
+    moves = _moves(likelihood)[:, :, displacing_parameters(likelihood)]
+    typical = np.sqrt(np.mean(np.sum((moves @ covariance) * moves, axis=2), axis=1))
+    basis = likelihood.model.basis(("offset_x", "offset_y"))
+    names = [parameter.name for parameter in likelihood.parameters]
+    curvature = np.empty((len(likelihood.model.sources), 2, 2))
     for axis, name in enumerate(("offset_x", "offset_y")):
         step = np.zeros(params.size)
-        step[posterior.parameter_names.index(name)] = typical[axis]
+        step[names.index(name)] = typical[axis]
         above, below = (
             likelihood.slopes(at, basis)[0][:, basis.row[-2:]]
             for at in (params + step, params - step)
         )
         curvature[:, :, axis] = (above - below) / (2.0 * typical[axis])  # the offset has a minus
     curvature = 0.5 * (curvature + curvature.transpose(0, 2, 1))
-    found = np.einsum("asj,sab,bsk->jk", moves, curvature, moves, optimize=True)
-    return np.asarray(found + prior)
+    return np.asarray(np.einsum("asj,sab,bsk->jk", moves, curvature, moves, optimize=True))
 
 
-def _moves(posterior: Posterior) -> Floats:
+def _moves(likelihood: FrameLikelihood) -> Floats:
     """What the parameters do to the image of every source, shape (2, s, d)."""
-    field, sources = posterior.model.polynomial, posterior.model.sources
-    out = np.zeros((2, len(sources), posterior.n_parameters))
+    field, sources = likelihood.model.polynomial, likelihood.model.sources
+    out = np.zeros((2, len(sources), len(likelihood.parameters)))
     zero = np.zeros(len(sources))
     design = field.design_matrix(zero, zero, sources.x, sources.y)
-    for k, parameter in enumerate(posterior.parameters):
+    for k, parameter in enumerate(likelihood.parameters):
         if parameter.kind == "distortion":
             out[:, :, k] = -design[:, :, parameter.slot]
         elif parameter.name.startswith("offset"):

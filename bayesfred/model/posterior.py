@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bayesfred._typing import Flags, Floats
+from bayesfred._typing import Flags, Floats, Ints
 from bayesfred.errors import InputError
 from bayesfred.imaging.forward import ForwardModel
 from bayesfred.imaging.psf import PSF, has_pixel
@@ -25,6 +25,7 @@ from bayesfred.model.frame_density import FrameDensity
 from bayesfred.model.likelihood import FrameLikelihood
 from bayesfred.model.near_mean import Around
 from bayesfred.model.noise import Noise, PoissonNoise
+from bayesfred.model.observed import displacing_parameters, observed_information
 from bayesfred.model.parameters import Nuisances, Parameter, parameter_table
 from bayesfred.model.pixels import usable_pixels
 from bayesfred.model.psf_errors import PsfErrors
@@ -215,6 +216,31 @@ class Posterior(FrameDensity):
         if not np.isfinite(self.log_prior(vector)[0]):
             return np.full((vector.size, vector.size), np.nan)
         return self.likelihood.fisher(vector)
+
+    def observed_information(self, params: npt.ArrayLike, expected: Floats) -> tuple[Ints, Floats]:
+        """The parameters that displace images, and the observed information about these.
+
+        Parameters
+        ----------
+        params : array_like, shape (d,)
+            Where the posterior has a density.
+        expected : ndarray, shape (d, d)
+            The information there.
+
+        Returns
+        -------
+        which : ndarray of int, shape (k,)
+            None where f or g depends on (u, v) or the pointing is no parameter.
+        information : ndarray, shape (k, k)
+            The others known, with the curvature of the prior.
+        """
+        which = displacing_parameters(self.likelihood)
+        if not which.size:
+            return super().observed_information(params, expected)
+        block = np.ix_(which, which)
+        covariance = np.asarray(np.linalg.inv(expected[block]), dtype=np.float64)
+        found = observed_information(self.likelihood, self._vector(params), covariance)
+        return which, found + self.prior_information(params)[block]
 
     def near(self, params: Floats, covariance: Floats) -> "Posterior":
         """The same posterior, with a faster `log_prob` around `params`.

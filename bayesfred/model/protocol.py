@@ -6,9 +6,10 @@ offers this, of frames or not. `model.posterior` is the one that the package is 
 
 from typing import Protocol, Self
 
+import numpy as np
 import numpy.typing as npt
 
-from bayesfred._typing import Floats
+from bayesfred._typing import Floats, Ints
 
 
 class TargetDensity(Protocol):
@@ -50,6 +51,13 @@ class TargetDensity(Protocol):
     def information(self, params: npt.ArrayLike) -> Floats:
         """Positive definite stand-in for minus the Hessian, shape (d, d): Fisher information."""
         ...
+
+    def observed_information(self, params: npt.ArrayLike, expected: Floats) -> tuple[Ints, Floats]:
+        """Some parameters, shape (k,), and minus the Hessian by these, (k, k), if it is known.
+
+        `expected` is the information at `params`.
+        """
+        return np.empty(0, np.int64), np.empty((0, 0))
 
     def near(self, params: Floats, covariance: Floats) -> Self:
         """The same density, prepared to be evaluated often around `params`."""

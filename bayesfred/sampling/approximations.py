@@ -31,9 +31,7 @@ from scipy.special import logsumexp
 
 from bayesfred._typing import Floats
 from bayesfred.errors import InputError
-from bayesfred.model.observed import displacing_parameters, observed_information
 from bayesfred.model.parameters import SCALES
-from bayesfred.model.posterior import Posterior
 from bayesfred.model.protocol import TargetDensity
 from bayesfred.optimize.estimate import MapEstimate, inverse
 
@@ -156,12 +154,12 @@ def _observed(posterior: TargetDensity, params: Floats) -> Floats | None:
     It changes the parameters that displace images; None where these are none, or the two differ by
     so much that the posterior is not normal.
     """
-    which = displacing_parameters(posterior) if isinstance(posterior, Posterior) else ()
-    if not len(which) or not isinstance(posterior, Posterior):
-        return None
     expected = posterior.information(params)
+    which, observed = posterior.observed_information(params, expected)
+    if not which.size:
+        return None
     root = cholesky(inverse(expected[np.ix_(which, which)]), lower=True)
-    relative = root.T @ observed_information(posterior, params, expected) @ root
+    relative = root.T @ observed @ root
     values, vectors = eigh(relative, check_finite=False)
     if not np.all((values > WIDEST**-2) & (values < WIDEST**2)):
         return None
