@@ -547,7 +547,7 @@ def test_a_source_that_crawls_in_a_large_cluster_ends_where_it_does_alone(
 
 
 def test_log_prob_is_finite_where_stars_blend_and_their_light_is_not_quite_known() -> None:
-    """In 15 of these 320 places steps of single sources made a step that led downhill.
+    """In 25 of these 320 places steps of single sources made a step that led downhill.
 
     From there shorter ones were taken for ever. Stars from 300 to 1e5 photons, half of which have a
     neighbour within 5 pixels; scatters and model errors from a fifth to five times the true ones.
