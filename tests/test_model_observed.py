@@ -52,7 +52,8 @@ def by_differences(posterior: bf.Posterior, params: Floats, which: Floats, share
 def relative(posterior: bf.Posterior, params: Floats, which: Floats) -> Floats:
     expected = posterior.information(params)
     root = np.linalg.cholesky(np.linalg.inv(expected[np.ix_(which, which)]))
-    return np.asarray(root.T @ posterior.observed_information(params, expected)[1] @ root)
+    covariance = np.linalg.inv(expected)
+    return np.asarray(root.T @ posterior.observed_information(params, covariance)[1] @ root)
 
 
 @pytest.mark.parametrize("basis", [False, True])
@@ -89,11 +90,17 @@ def test_where_it_is_not_told() -> None:
         bf.Posterior(posterior.model, posterior.counts, nuisances=replace(SCATTER, offset=False)),
     ):
         assert displacing_parameters(other.likelihood).size == 0
-        assert approximations._observed(other, other.start()) is None
+        assert approximations._observed(other, other.start(), np.eye(other.n_parameters)) is None
     # nor where the posterior is not normal
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(approximations, "WIDEST", 1.01)
-        assert approximations._observed(posterior, best.params) is None
+        assert approximations._observed(posterior, best.params, best.covariance) is None
+    # or where a source has no image
+    nowhere = (np.arange(8), np.full((8, 8), np.nan))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bf.Posterior, "observed_information", lambda *_: nowhere)
+        assert approximations._observed(posterior, best.params, best.covariance) is None
+    assert approximations._observed(posterior, best.params, best.covariance) is not None
 
 
 @pytest.mark.slow

@@ -34,7 +34,8 @@ def displacing_parameters(likelihood: FrameLikelihood) -> Ints:
 
     Returns
     -------
-    ndarray of int
+    ndarray of int, shape (k,)
+        The coefficients, then the offset.
     """
     field, parameters = likelihood.model.polynomial, likelihood.parameters
     whole = all(t[U] == t[V] == 0 for t in (*field.f_terms, *field.g_terms))
@@ -52,23 +53,25 @@ def observed_information(likelihood: FrameLikelihood, params: Floats, covariance
     likelihood : FrameLikelihood
         Which has some.
     params : ndarray, shape (d,)
-        Where it is not zero.
     covariance : ndarray, shape (k, k)
-        Of these parameters, the others known: as far apart as draws from it displace the sources
-        the slopes are taken.
+        Of these parameters: as far apart as draws displace the sources the slopes are taken.
 
     Returns
     -------
     ndarray, shape (k, k)
+        NaN where the likelihood is zero at one of the offsets.
     """
-    moves = _moves(likelihood)[:, :, displacing_parameters(likelihood)]
+    field, sources = likelihood.model.polynomial, likelihood.model.sources
+    at_rest = np.zeros(len(sources))
+    design = field.design_matrix(at_rest, at_rest, sources.x, sources.y)
+    offset = np.broadcast_to(np.eye(2)[:, None], (2, len(sources), 2))
+    moves = np.concatenate([-design, offset], axis=2)  # of every image, shape (2, s, k)
     typical = np.sqrt(np.mean(np.sum((moves @ covariance) * moves, axis=2), axis=1))
     basis = likelihood.model.basis(("offset_x", "offset_y"))
-    names = [parameter.name for parameter in likelihood.parameters]
-    curvature = np.empty((len(likelihood.model.sources), 2, 2))
-    for axis, name in enumerate(("offset_x", "offset_y")):
+    curvature = np.empty((len(sources), 2, 2))
+    for axis, k in enumerate(displacing_parameters(likelihood)[-2:]):
         step = np.zeros(params.size)
-        step[names.index(name)] = typical[axis]
+        step[k] = typical[axis]
         above, below = (
             likelihood.slopes(at, basis)[0][:, basis.row[-2:]]
             for at in (params + step, params - step)
@@ -76,17 +79,3 @@ def observed_information(likelihood: FrameLikelihood, params: Floats, covariance
         curvature[:, :, axis] = (above - below) / (2.0 * typical[axis])  # the offset has a minus
     curvature = 0.5 * (curvature + curvature.transpose(0, 2, 1))
     return np.asarray(np.einsum("asj,sab,bsk->jk", moves, curvature, moves, optimize=True))
-
-
-def _moves(likelihood: FrameLikelihood) -> Floats:
-    """What the parameters do to the image of every source, shape (2, s, d)."""
-    field, sources = likelihood.model.polynomial, likelihood.model.sources
-    out = np.zeros((2, len(sources), len(likelihood.parameters)))
-    zero = np.zeros(len(sources))
-    design = field.design_matrix(zero, zero, sources.x, sources.y)
-    for k, parameter in enumerate(likelihood.parameters):
-        if parameter.kind == "distortion":
-            out[:, :, k] = -design[:, :, parameter.slot]
-        elif parameter.name.startswith("offset"):
-            out[("offset_x", "offset_y").index(parameter.name), :, k] = 1.0
-    return out

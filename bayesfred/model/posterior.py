@@ -217,29 +217,29 @@ class Posterior(FrameDensity):
             return np.full((vector.size, vector.size), np.nan)
         return self.likelihood.fisher(vector)
 
-    def observed_information(self, params: npt.ArrayLike, expected: Floats) -> tuple[Ints, Floats]:
+    def observed_information(
+        self, params: npt.ArrayLike, covariance: Floats
+    ) -> tuple[Ints, Floats]:
         """The parameters that displace images, and the observed information about these.
 
         Parameters
         ----------
         params : array_like, shape (d,)
-            Where the posterior has a density.
-        expected : ndarray, shape (d, d)
-            The information there.
+        covariance : ndarray, shape (d, d)
+            How far around.
 
         Returns
         -------
         which : ndarray of int, shape (k,)
             None where f or g depends on (u, v) or the pointing is no parameter.
         information : ndarray, shape (k, k)
-            The others known, with the curvature of the prior.
+            The others known, with the curvature of the prior; NaN where there is no density.
         """
         which = displacing_parameters(self.likelihood)
         if not which.size:
-            return super().observed_information(params, expected)
+            return super().observed_information(params, covariance)
         block = np.ix_(which, which)
-        covariance = np.asarray(np.linalg.inv(expected[block]), dtype=np.float64)
-        found = observed_information(self.likelihood, self._vector(params), covariance)
+        found = observed_information(self.likelihood, self._vector(params), covariance[block])
         return which, found + self.prior_information(params)[block]
 
     def near(self, params: Floats, covariance: Floats) -> "Posterior":

@@ -52,10 +52,12 @@ class TargetDensity(Protocol):
         """Positive definite stand-in for minus the Hessian, shape (d, d): Fisher information."""
         ...
 
-    def observed_information(self, params: npt.ArrayLike, expected: Floats) -> tuple[Ints, Floats]:
-        """Some parameters, shape (k,), and minus the Hessian by these, (k, k), if it is known.
+    def observed_information(
+        self, params: npt.ArrayLike, covariance: Floats
+    ) -> tuple[Ints, Floats]:
+        """Some parameters, shape (k,), and minus the Hessian by these, (k, k), where it is known.
 
-        `expected` is the information at `params`.
+        `covariance`, shape (d, d), tells how far around `params` it matters.
         """
         return np.empty(0, np.int64), np.empty((0, 0))
 

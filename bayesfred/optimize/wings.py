@@ -13,13 +13,12 @@ from scipy import ndimage, spatial
 
 from bayesfred._typing import Floats
 from bayesfred.model.posterior import Posterior
-from bayesfred.optimize.local_background import LARGEST
+from bayesfred.optimize.local_background import LARGEST, MAD
 
 MOST, FEWEST = 300, 8  # sources that are looked at, the brightest ones
 OUTER = 3.0  # radii of the footprint, to which pixels are looked at
 PIXELS = 3  # of a ring, at least
 CLIP, ROUNDS = 4.0, 4  # standard deviations at which a source is left out
-MAD = 0.6745  # median of the size of a normal number
 FAR = 0.75  # of the pixels around the images are nearer than those that they are compared with
 SURE = 5.0  # standard deviations of a ring's excess
 NOTICEABLE, ENDED = 5.0, 1.0  # standard deviations of the misfit: of all rings, of each
@@ -117,7 +116,7 @@ def _rings(
 ) -> tuple[Floats, Floats]:
     """Mean and number of the pixels of every source's rings, a pixel wide; the last has the rest.
 
-    A pixel belongs to the nearest image; rings are those within which half of the pixels lie.
+    A pixel belongs to the nearest image; rings are those within which most of the pixels lie.
     """
     tree, reach = spatial.cKDTree(images), OUTER * radius
     ring, source, value = [], [], []
@@ -146,14 +145,14 @@ def _proportion(flux: Floats, mean: Floats, number: Floats, noise: float) -> tup
     enough = np.all(number >= PIXELS, axis=1)
     sd = np.sqrt(noise * np.sum(1.0 / number[enough], axis=1))
     light, pull = flux[enough] / sd, (mean[enough, 0] - mean[enough, 1]) / sd
-    kept = np.ones(light.size, bool)
+    found, wider, kept = 0.0, np.inf, np.ones(light.size, bool)
     for _ in range(ROUNDS):
         if kept.sum() < FEWEST:
-            break
+            return 0.0, np.inf
         found = float(light[kept] @ pull[kept] / np.sum(light[kept] ** 2))
         off = np.abs(pull - found * light)
         wider = max(float(np.median(off)) / MAD, 1.0)
         before, kept = kept, off <= CLIP * wider
         if np.array_equal(before, kept):
-            return found, wider / float(np.sum(light[kept] ** 2)) ** 0.5
-    return 0.0, np.inf
+            break
+    return found, wider / float(np.sum(light[before] ** 2)) ** 0.5

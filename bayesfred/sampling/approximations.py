@@ -89,12 +89,13 @@ def approximations(
                 for j, name in enumerate(posterior.parameter_names)
                 if name in SCALES and name not in posterior.hyperparameters
             ]
-        known = _observed(posterior, mean) if posterior.hyperparameters or scales else None
         if posterior.hyperparameters and k < modes.count:
             width = 0.5 if standing_for_it else 1.0
+            known = _observed(posterior, mean, covariance)
             means, covariances, weights = _nested(posterior, mean, covariance, scales, width, known)
         else:
             if scales:
+                known = _observed(posterior, mean, covariance)
                 mean, covariance, _ = _given(posterior, mean, covariance, scales, None, known)
             elif outside:
                 mean = mean + covariance @ posterior.gradient(mean)
@@ -148,24 +149,23 @@ def _given(
     return mean, found, value
 
 
-def _observed(posterior: TargetDensity, params: Floats) -> Floats | None:
+def _observed(posterior: TargetDensity, params: Floats, covariance: Floats) -> Floats | None:
     """What turns the errors by the Fisher information into those by the observed one, (d, d).
 
-    It changes the parameters that displace images; None where these are none, or the two differ by
-    so much that the posterior is not normal.
+    None where it is known of no parameter, or where the two differ by so much that the posterior is
+    not normal.
     """
-    expected = posterior.information(params)
-    which, observed = posterior.observed_information(params, expected)
-    if not which.size:
+    which, observed = posterior.observed_information(params, covariance)
+    block = np.ix_(which, which)
+    if not which.size or not np.all(np.isfinite(observed)):
         return None
-    root = cholesky(inverse(expected[np.ix_(which, which)]), lower=True)
-    relative = root.T @ observed @ root
-    values, vectors = eigh(relative, check_finite=False)
+    root = cholesky(inverse(inverse(covariance)[block]), lower=True)  # the others known
+    values, vectors = eigh(root.T @ observed @ root)
     if not np.all((values > WIDEST**-2) & (values < WIDEST**2)):
         return None
     change = root @ (vectors / np.sqrt(values)) @ vectors.T
     out = np.eye(params.size)
-    out[np.ix_(which, which)] = solve_triangular(root, change.T, lower=True, trans=1).T
+    out[block] = solve_triangular(root, change.T, lower=True, trans=1).T
     return out
 
 

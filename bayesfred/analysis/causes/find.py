@@ -63,6 +63,7 @@ def find_causes(
             findings += found
     if context.light.matched.any() or context.bright.any():
         place = placement(context)
+        # where both explain all of it the first one counts, and wings look like a background
         findings += [place, wings(context), *background_and_noise(context)]
         if place is None or place.cause.name != "unmatched":
             findings += [fluxes(context), psf(context), companions(context), scatter(context)]
