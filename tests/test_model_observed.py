@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 
 import bayesfred as bf
 from bayesfred.model.observed import displacing_parameters
@@ -80,6 +81,20 @@ def test_blended_sources_are_displaced_alike() -> None:
     found = relative(posterior, best.params, which)
     exact = by_differences(posterior, best.params, which, 1.0)
     assert found == pytest.approx(exact, abs=0.03)
+
+
+def test_the_priors_curvature_is_in_it() -> None:
+    """A prior of a coefficient as narrow as its error doubles the information about it."""
+    posterior, best = stars(5)
+    sd = float(np.linalg.inv(posterior.information(best.params))[0, 0] ** 0.5)
+    narrow = {"f_x": stats.norm(best.params[0], sd)}
+    other = replace(posterior, prior={**posterior.prior, **narrow})
+    before, after = (
+        each.observed_information(best.params, best.covariance)[1] for each in (posterior, other)
+    )
+    added = np.zeros_like(before)
+    added[0, 0] = sd**-2 - posterior.prior_curvature(best.params)[0]
+    np.testing.assert_allclose(after - before, added, rtol=1e-6, atol=1e-6 * before.max())
 
 
 def test_where_it_is_not_told() -> None:

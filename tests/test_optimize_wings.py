@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from test_optimize_local_background import haunted
 
 import bayesfred as bf
+from bayesfred.commands import pipeline
 from bayesfred.optimize import wings
 from bayesfred.optimize.wings import wings_outside
 
@@ -21,7 +22,12 @@ LEVEL, FLUX = 200.0, 1e5
 def haloed(
     seed: int, share: float = SHARE, footprint: float = 6.0, flux: float = FLUX
 ) -> bf.Posterior:
-    """81 stars of various fluxes, 22 pixels apart, each in a halo."""
+    """81 stars of various fluxes, 22 pixels apart, each in a halo, with footprints around them."""
+    return bf.follow_images(unfollowed(seed, share, footprint, flux))
+
+
+def unfollowed(seed: int, share: float, footprint: float, flux: float) -> bf.Posterior:
+    """The same before the footprints are around the images."""
     rng = np.random.default_rng(seed)
     grid = bf.SourceCatalog.grid(9, 22.0, flux)
     sources = replace(grid, flux=flux * rng.lognormal(0.0, 0.5, len(grid)))
@@ -33,7 +39,7 @@ def haloed(
     model = bf.ForwardModel(detector, sources, bf.GaussianPSF(1.3), LENS)
     counts = rng.poisson(mean + LEVEL).astype(float)
     nuisances = bf.Nuisances("free", offset=True, footprint=footprint)
-    return bf.follow_images(bf.Posterior(model, counts, nuisances=nuisances))
+    return bf.Posterior(model, counts, nuisances=nuisances)
 
 
 def found(posterior: bf.Posterior) -> wings.Wings | None:
@@ -66,6 +72,22 @@ def test_wings_are_those_of_the_halo() -> None:
 
 def test_no_wings_where_there_are_none() -> None:
     assert all(found(haloed(seed, 0.0)) is None for seed in range(3, 7))
+
+
+def test_wings_that_no_fit_would_notice_are_not_told() -> None:
+    """Though they are there, by 3 standard deviations of the misfit."""
+    posterior = haloed(14, flux=1.9e4)
+    assert found(posterior) is None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wings, "NOTICEABLE", 2.0)
+        assert found(posterior) is not None
+
+
+def test_a_line_before_the_fit_tells_of_them() -> None:
+    for share, told in ((SHARE, True), (0.0, False)):
+        _, _, lines = pipeline._follow(unfollowed(15, share, 6.0, FLUX), None, rough=False)
+        assert any("light outside their footprints" in line for line in lines) == told
+        assert not any(line.startswith("background: ") for line in lines)
 
 
 def test_structure_of_the_background_is_no_wing() -> None:
@@ -121,6 +143,14 @@ def test_the_verdict_names_them_and_the_remedy_cures(flux: float) -> None:
     assert radius is not None and bool(radius[2]) == (flux > 1e5)
     # all of it, where there is more than can be seen
     assert fitted(float(radius[1]) if flux < 1e6 else 18.0)[1].fits_data
+
+
+@pytest.mark.slow
+def test_they_are_named_before_the_background_that_they_seem_to_be() -> None:
+    """Each would explain more than the misfit."""
+    posterior = haloed(12, footprint=9.0, flux=1e6)
+    posterior, estimate = bf.measure_psf(posterior, bf.find_map(posterior))
+    assert bf.find_causes(posterior, estimate.params)[0].name == "wings"
 
 
 def test_faults_of_other_kinds_are_no_wings() -> None:
