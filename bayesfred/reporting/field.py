@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from bayesfred._typing import Floats
 from bayesfred.analysis.field import DisplacementField
 from bayesfred.io.summary_table import Table
+from bayesfred.model.kernels.clusters import DOF
 from bayesfred.reporting.style import POSTERIOR_COLOUR, TRUTH_COLOUR
 
 __all__ = ["field_plot"]
@@ -27,13 +28,17 @@ __all__ = ["field_plot"]
 SIZES = LinearSegmentedColormap.from_list("sizes", ["#ffffff", "#9ecae1", "#4292c6"])
 EXTRAPOLATED = "0.45"
 SIGNIFICANT = 3.0  # standard deviations
+# scales of Student's t distribution along two axes that are exceeded as rarely
+AS_RARE = math.sqrt(DOF * math.expm1(SIGNIFICANT**2 / DOF))
 WIDTH, SIDE = 6.2, 4.4  # inch, of the figure and a panel
 BELOW, ABOVE = 0.75, 0.55  # inch, around a panel
 
 Strings = NDArray[np.str_]
 
 
-def field_plot(field: DisplacementField, sources: Table, binning: int = 1) -> Figure:
+def field_plot(
+    field: DisplacementField, sources: Table, binning: int = 1, scatter: float = 0.0
+) -> Figure:
     """The displacement over the frame with its errors, and how far the sources are off the model.
 
     Parameters
@@ -43,6 +48,8 @@ def field_plot(field: DisplacementField, sources: Table, binning: int = 1) -> Fi
         Of `bayesfred.analysis.sources.source_table`, whose lengths are recorded pixels.
     binning : int
         Fine pixels along each side of a recorded pixel.
+    scatter : float, fine pixel
+        The scale of Student's t distribution by which positions scatter; 0 where they do not.
 
     Returns
     -------
@@ -64,7 +71,7 @@ def field_plot(field: DisplacementField, sources: Table, binning: int = 1) -> Fi
             xlabel=f"u / {unit}", ylabel=f"v / {unit}",
         )  # fmt: skip
     _displacements(fig, above, field, unit)
-    _residuals(below, field, sources, (binning, unit))
+    _residuals(below, field, sources, (binning, unit), scatter)
     return fig
 
 
@@ -104,7 +111,9 @@ def _displacements(fig: Figure, ax: Axes, field: DisplacementField, unit: str) -
     )  # fmt: skip
 
 
-def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[int, str]) -> None:
+def _residuals(
+    ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[int, str], scatter: float
+) -> None:
     """By how much the counts say that each source is off the place where the model has it."""
     binning, unit = pixel
     at, off, sd = (
@@ -114,7 +123,7 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
     known = np.isfinite(at + off + sd).all(axis=1)
     at, off, sd = at[known], off[known], sd[known]
     ax.plot(at[:, 0], at[:, 1], ".", color="0.3", markersize=3)
-    far = np.hypot(*(off / sd).T) > SIGNIFICANT
+    far = np.hypot(*(off / np.hypot(sd, AS_RARE / SIGNIFICANT * scatter)).T) > SIGNIFICANT
     length = np.hypot(*off.T)
     # a faint source's arrow, which is noise, would make those of the others too small to be seen
     short = length <= 3.0 * np.quantile(length, 0.95) if len(at) else np.zeros(0, dtype=bool)
@@ -122,9 +131,10 @@ def _residuals(ax: Axes, field: DisplacementField, sources: Table, pixel: tuple[
     scale = arrows(ax, at[short], off[short], 3.0 * _spacing(field), unit, colours)
     by_chance = len(at) * math.exp(-0.5 * SIGNIFICANT**2)  # of normal errors along two axes
     ax.plot(*at[far & ~short].T, "x", color=TRUTH_COLOUR)
+    errors = f"{SIGNIFICANT:.0f} sd" + (" and their scatter" if scatter else "")
     ax.set_title(
-        f"sources, off the model{scale}\n{far.sum()} of {len(at)} by more than "
-        f"{SIGNIFICANT:.0f} sd (orange), {by_chance:.0f} by chance",
+        f"sources, off the model{scale}\n{far.sum()} of {len(at)} by more than {errors} (orange), "
+        f"{by_chance:.0f} by chance",
         loc="left", fontsize=11, y=1.0,  # else all labels are measured for it
     )  # fmt: skip
 

@@ -82,6 +82,9 @@ def page_figures(
     list of PageFigure
     """
     posterior = chain.posterior()
+    detector = posterior.model.detector
+    known = dict(zip(posterior.parameter_names, chain.estimate.params, strict=True))
+    scatter = float(known.get("position_scatter", 0.0))
     u, v, half_width = _star_positions(chain, posterior)
     figures = [
         PageFigure(
@@ -93,7 +96,7 @@ def page_figures(
             "arrows that agree with their neighbours mean a missing term. The longest arrows are "
             "left out; a cross stands for one of more than 3 standard deviations.",
             field.message,
-            png(field_plot(field, diagnostics.sources, posterior.model.detector.binning)),
+            png(field_plot(field, diagnostics.sources, detector.binning, scatter)),
         ),
         PageFigure(
             "Frame, model and residual",
