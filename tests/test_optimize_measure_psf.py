@@ -135,6 +135,40 @@ def test_a_psf_that_leaves_much_should_vary_more():
         assert psf_message(posterior, replace(estimate, params=params)).endswith(said)
 
 
+def widening(seed: int, number: int, side: int, most: float) -> bf.Posterior:
+    """Stars of a Moffat's shape that is up to `most` wider outward, taken for a Gaussian."""
+    rng, terms = np.random.default_rng(seed), [(1, 0, 0, 0), (0, 1, 0, 0)]
+    x, y = rng.uniform(-0.5 * side, 0.5 * side, (2, number))
+    flux, lens = 10.0 ** rng.uniform(3.0, 6.0, number), bf.PolynomialDistortion(terms, terms)
+    detector = bf.Detector((side, side), pixel="box")
+    rings = np.digitize((x**2 + y**2) / (0.5 * side) ** 2, [0.1, 0.3, 0.6, 1.0, 1.4])
+    mean = np.full((side, side), 20.0)
+    for ring in np.unique(rings):
+        own = bf.SourceCatalog(*(column[rings == ring] for column in (x, y, flux)))
+        psf = bf.MoffatPSF(1.6 * (1.0 + most * ring / 5.0), 3.5)
+        mean += bf.ForwardModel(detector, own, psf, lens).expected_counts(np.zeros(4), 0.0)
+    x, y = np.stack([x, y]) + 0.02 * rng.normal(size=(2, number))
+    model = bf.ForwardModel(detector, bf.SourceCatalog(x, y, flux), bf.GaussianPSF(1.0), lens)
+    nuisances = bf.Nuisances("free", offset=True, position_scatter=True, footprint=7.0)
+    return bf.Posterior(model, rng.poisson(mean), nuisances=nuisances)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "number", "side", "most"), [(0, 300, 301, 0.6), (2, 500, 401, 0.8)]
+)
+def test_one_psf_is_found_where_the_images_widen_outward(
+    seed: int, number: int, side: int, most: float
+) -> None:
+    """Steps went to and fro for all 40 turns, and nothing said that the PSF should vary.
+
+    Of the second frame they do so without the secants, of both if the end has to be exact.
+    """
+    posterior = widening(seed, number, side, most)
+    psf, *_ = measuring.find_psf(posterior, bf.find_map(posterior), 4, 0, 0)
+    assert psf.model_error > 0.1
+
+
 def undersampled(seed: int) -> tuple[bf.Posterior, np.ndarray]:
     """144 stars of a FWHM of 1.2 pixels that lie off the catalogue, the PSF taken for a Gaussian.
 

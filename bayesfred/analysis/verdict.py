@@ -25,6 +25,7 @@ from bayesfred.model.noise import SubtractedNoise
 from bayesfred.optimize.estimate import MapEstimate
 from bayesfred.optimize.fit_statistics import CONSISTENT, consistent, misfit
 from bayesfred.optimize.matched import enough_matched, source_light
+from bayesfred.optimize.psf_equations import LARGEST_ERROR
 from bayesfred.sampling.chain import Chain
 from bayesfred.sampling.laplace import ApproximationCheck
 
@@ -105,7 +106,7 @@ def judge_fit(
     params, matched, unmatched = estimate.params, "", ""
     if residuals is not None:
         light = source_light(posterior, params)
-        matched = f", {light.matched.sum()} of {len(light.matched)} sources matched"
+        matched = f", {light.count}"
         if not enough_matched(posterior, light):
             consist, unmatched = False, matched.removeprefix(", ")
         failures = _failures(residuals)
@@ -119,6 +120,7 @@ def judge_fit(
             causes = (*causes, displaced_alike(residuals.neighbours, scatters=scatters))
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
+    why = _poor_psf(posterior, params) + _why(causes)
     if fits and not estimate.fits_data:
         fits, sentence = False, f"The parameters may be wrong: {estimate.message}."
     elif fits:
@@ -126,13 +128,13 @@ def judge_fit(
     elif consist:
         sentence = (
             f"The model does not fit the counts: {failures}, where sums over all pixels do not "
-            f"show it ({sums} expectation{matched}). {_why(causes)}"
+            f"show it ({sums} expectation{matched}). {why}"
         )
     else:
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
-        sentence = f"The model does not fit the counts: {sums} {bound}. {_why(causes)}"
+        sentence = f"The model does not fit the counts: {sums} {bound}. {why}"
     sentence += _far_off(residuals) + _in_common(posterior)
-    omitted = _omitted(posterior, fit, fits) + _unexplained(posterior, params)
+    omitted = _omitted(posterior, fit, fits) + _unexplained(posterior, params, fits=fits)
     return FitVerdict(fits, causes, sentence, omitted, unmatched)
 
 
@@ -341,15 +343,33 @@ def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
     return f"{sentence}, and the misfit: as mere noise it would make them {factor:.2g} times wider."
 
 
-def _unexplained(posterior: Any, params: Floats) -> str:
-    """Say of a large model error that it is one."""
-    if not posterior.nuisances.model_error:
+def _unexplained(posterior: Any, params: Floats, *, fits: bool) -> str:
+    """Say of a large model error that it is one; so large a one is said first of what misfits."""
+    error = _model_error(posterior, params)
+    if error <= CHECKED or (error > LARGEST_ERROR and not fits):
         return ""
-    error = float(params[posterior.parameter_names.index("model_error")])
-    if error <= CHECKED:
-        return ""
-    remedy = psf_remedy(posterior, 'measure it on the frame (psf.kind = "measured")')
     return (
         f" The PSF leaves {error:.0%} of the light unexplained, and errors were checked up to "
-        f"{CHECKED:.0%}: {remedy}, or test them with bayesfred crosscheck."
+        f"{CHECKED:.0%}: {_other_psf(posterior)}, or test them with bayesfred crosscheck."
     )
+
+
+def _poor_psf(posterior: Any, params: Floats) -> str:
+    """Say of a PSF that leaves much of the light that this comes before all other causes."""
+    error = _model_error(posterior, params)
+    if error <= LARGEST_ERROR:
+        return ""
+    return (
+        f"The PSF leaves {error:.0%} of the light unexplained, which hides what else is wrong: "
+        f"{_other_psf(posterior)}. "
+    )
+
+
+def _model_error(posterior: Any, params: Floats) -> float:
+    if not posterior.nuisances.model_error:
+        return 0.0
+    return float(params[posterior.parameter_names.index("model_error")])
+
+
+def _other_psf(posterior: Any) -> str:
+    return psf_remedy(posterior, 'measure it on the frame (psf.kind = "measured")')

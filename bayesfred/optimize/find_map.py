@@ -300,12 +300,13 @@ def _judged(
 def _fits(given: Posterior, kept: Kept, params: Floats) -> tuple[tuple[bool, str], str]:
     """Whether what is kept of a frame fits, with advice, and how many sources are matched."""
     posterior = kept.posterior
-    light, sources = source_light(posterior, params), len(posterior.model.sources)
-    how = f", {light.matched.sum()} of {sources} sources matched"
+    light = source_light(posterior, params)
+    how = f", {light.count}"
     fit, rejecting = fit_statistics(posterior, params), posterior is not given
     if rejecting:
         pixels = given.mask.sum() - posterior.mask.sum()
-        how += f", {len(given.model.sources) - sources} sources and {pixels} pixels rejected"
+        sources = len(given.model.sources) - len(posterior.model.sources)
+        how += f", {sources} sources and {pixels} pixels rejected"
     enough = enough_matched(posterior, light)
     if kept.share > BREAKDOWN:
         return (False, MOSTLY_REJECTED), how

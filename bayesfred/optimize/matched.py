@@ -68,6 +68,13 @@ class SourceLight:
     displacement_sd: Floats
 
     @property
+    def count(self) -> str:
+        """How many sources are matched, in words."""
+        beyond = int(np.sum(~self.inside))
+        more = f", {beyond} outside the pixels that are used" if beyond else ""
+        return f"{self.matched.sum()} of {self.matched.size} sources matched{more}"
+
+    @property
     def pooled(self) -> float:
         """Signal to noise of all sources' light together, if their fluxes are known."""
         power = self.power[self.inside]

@@ -13,12 +13,14 @@ from bayesfred.optimize.anderson import accelerated
 from bayesfred.optimize.psf_equations import SECANTS, STILL, PsfEquations, PsfState, field_radius
 
 TURNS = 40
+LATE, NEARLY = 16, 0.01  # turns after which this of an unknown's variance is near enough
 CHOOSING = 8  # turns of the strengths of the prior within one
 ROUGH = 100.0  # squared standard deviations of an unknown, of a state to begin from
 EXACT = 4  # turns in which the model is taken to be exact, at the most
 PATIENCE = 6  # turns without a nearer place after which an information leads no more
 FARTHER = 10.0  # than the nearest place: there it leads no more at all
 LARGEST = 0.4  # change of the PSF in one turn, share of its peak
+LEAST = 0.125  # share of a turn's step
 DARKEST = 0.1  # of its value that a flux may fall to in one turn
 
 
@@ -52,24 +54,39 @@ def solved(
     InputError
         If no solution is found.
     """
-    close = False
+    close, share, before = False, 1.0, None
     for turn in range(TURNS):
         equations = PsfEquations.of(posterior, state, exact=exact)
         # strengths that are iterated until they rest are the same whatever the start
         equations = equations.with_strengths(CHOOSING if close else 1)
         far = how_far(equations)
+        if before is not None and not exact:
+            share = float(np.clip(_secant(equations, before, share), LEAST, 1.0))
         close = far < (ROUGH if rough else 1.0) * equations.pull.size
-        if not exact and (far < STILL or (close and rough)):
+        enough = STILL if turn < LATE else NEARLY * equations.pull.size
+        if not exact and (far < enough or (close and rough)):
             return equations
         if close and not exact:
             equations = _followed(posterior, equations)
-        state = moved(posterior, equations.state, change_of(equations))
+        before = equations.step
+        state = moved(posterior, equations.state, share * change_of(equations))
         # a model error that came first would explain what a PSF too smooth leaves
         exact = exact and not close and turn + 1 < EXACT
     raise InputError(
         f"psf: no PSF found in {TURNS} turns: expected a start that resembles it: fit the width "
         "first (nuisances: psf_sigma), or begin from another PSF"
     )
+
+
+def _secant(equations: PsfEquations, before: Floats, share: float) -> float:
+    """The share of a step that would have ended where nothing is left of it, along itself.
+
+    Weights follow the light, so that steps may go to and fro.
+    """
+    upper, scale = equations.factor
+    taken = upper @ (before / scale)
+    left = float(taken @ equations.measured) / float(taken @ taken)
+    return share / (1.0 - left) if left < 1.0 else 1.0
 
 
 def how_far(equations: PsfEquations) -> float:

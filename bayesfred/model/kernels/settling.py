@@ -87,10 +87,10 @@ def _learn(change, step, h):
 
 
 @inner()
-def _fill_h(source, h):
-    """A source's block of H."""
-    gram(source.touching, source.group, source.patch.weight, source.canvas.at, h)
-    add_prior(h, source.group, source.prior, source.fluxes, source.shifts, SHARE)
+def _fill_h(cluster, h):
+    """H, or a source's block of it."""
+    gram(cluster.touching, cluster.group, cluster.patch.weight, cluster.canvas.at, h)
+    add_prior(h, cluster.group, cluster.prior, cluster.fluxes, cluster.shifts, SHARE)
 
 
 @inner()
@@ -160,4 +160,9 @@ def maximize(frame, parameters, cluster, known, h):
         for i in range(members.size):
             if not abs(distances[i]) <= CLOSE:
                 settle(frame, parameters, alone(cluster, i), own)
-    return search(frame, parameters, cluster, known, h, (distances, 0))
+    gain = search(frame, parameters, cluster, known, h, (distances, 0))
+    if settles and math.isnan(gain):
+        # far from any maximum of the parameters the place where it ended will do
+        _fill_h(cluster, h)
+        return 0.0 if cholesky(h, cluster.group) else math.nan
+    return gain

@@ -271,6 +271,32 @@ def turn_back(frame, parameters, cluster, way, value):
 
 
 @inner()
+def go_on(frame, parameters, cluster, way, value):
+    """Go as far again as the step led, and twice as far, as long as the log-density rises.
+
+    Where the second derivatives are left out steps may be far too short. `way` is the step and what
+    share of it was taken. Returns the log-density.
+    """
+    step, shares = way
+    for _ in range(HALVES):
+        for i in range(shares.size):
+            if shares[i] * _relative(cluster, step, i) >= 0.5:
+                return value
+        for i in range(shares.size):
+            own = shares[i] * step[3 * i : 3 * i + 3]
+            change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+        here = log_density(frame, parameters, cluster)
+        if here <= value:
+            for i in range(shares.size):
+                own = -shares[i] * step[3 * i : 3 * i + 3]
+                change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+            return value
+        value = here
+        shares *= 2.0
+    return value
+
+
+@inner()
 def _change_of_width(cluster, nearby, shares, step):
     """By how much -1/2 log det H changes on the rest of the way, see `gradient.py`."""
     total, scatter = 0.0, cluster.prior.scatter
@@ -351,6 +377,8 @@ def search(frame, parameters, cluster, known, h, left):
         if visit >= PATIENT and size > 1 and distance > (CERTAIN if visit < AS_ONE else FLAT):
             way = step, shares
             value = turn_back(frame, parameters, cluster, way, value)
+            if visit >= ENDLESS:
+                value = go_on(frame, parameters, cluster, way, value)
         if visit > ENDLESS and size > 1 and distance <= FLAT:
             return 0.0 if cholesky(h, group) else math.nan
         rest = distance * min(rate, 1.0)
