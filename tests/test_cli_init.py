@@ -137,6 +137,33 @@ def test_hot_pixels_are_no_stars(
     assert run.nuisances.footprint > 2.0 * fwhm
 
 
+@pytest.mark.parametrize(
+    ("grows", "n", "proposed"),
+    [(0.0, 26, (0, 0)), (0.0, 14, (0, 0)), (0.1, 26, (0, 7)), (0.3, 14, (2, 0)), (0.3, 5, (0, 0))],
+)
+def test_a_psf_that_varies_is_proposed_where_images_widen_outward(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grows: float, n: int, proposed: tuple[int, int]
+) -> None:
+    """Of n x n vignetted pinholes, a few of them saturated; of 25 nothing can be said."""
+    monkeypatch.chdir(tmp_path)
+    rng, size, grid = np.random.default_rng(n), 16 * n, 16.0 * (np.arange(n) - 0.5 * (n - 1))
+    x, y = (each.ravel() + rng.uniform(-2.0, 2.0, n * n) for each in np.meshgrid(grid, grid))
+    outward = 2.0 * np.hypot(x, y) / size
+    flux = 10.0 ** rng.uniform(4.0, 5.5, x.size) * (1.0 - 0.4 * outward**2)
+    rings, light = np.round(5.0 * outward).astype(int), np.full((size, size), 50.0)
+    for ring in np.unique(rings):
+        own = bf.SourceCatalog(*(column[rings == ring] for column in (x, y, flux)))
+        psf = bf.MoffatPSF(2.0 * (1.0 + grows * (ring / 5.0) ** 2), 3.0)
+        lens = bf.PolynomialDistortion([(1, 0, 0, 0)], [])
+        model = bf.ForwardModel(bf.Detector((size, size), pixel="box"), own, psf, lens)
+        light += model.expected_counts([0.0], 0.0)
+    counts = np.minimum(np.round(rng.poisson(light) / 1.5 + 200.0), 16383.0)
+    fits.PrimaryHDU(counts.astype(np.uint16)).writeto("night.fits")
+    assert invoke("night.fits")[0] == 0
+    psf_settings = read_settings(tmp_path / "night.toml").psf
+    assert (psf_settings.degree, psf_settings.nodes) == proposed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fwhm", [1.4, 3.0])
 def test_what_is_proposed_fits_a_strangers_frame(

@@ -18,7 +18,8 @@ from bayesfred.io.frames import read_stored
 from bayesfred.io.headers import noise_in, units
 from bayesfred.io.paths import may_write
 from bayesfred.io.saturation import plateau
-from bayesfred.optimize.image_widths import START, image_widths
+from bayesfred.optimize.image_widths import START, OutwardWidths, image_widths, outward_widths
+from bayesfred.optimize.measure_psf import EACH, NODES
 from bayesfred.settings.sections import toml_text
 
 FOOTPRINT, LEAST_FOOTPRINT = 4.5, 5.0  # widths that an image reaches, and pixels
@@ -41,7 +42,7 @@ pixel = "box"
 [psf]
 kind = "measured"  # on the frame's own sources
 sigma = {sigma:.2g}  # pixels, a start: by the brightest peaks
-# degree = 1  # where the PSF varies over the field; of hundreds of sources nodes = 7 instead
+{varying}
 
 [distortion]
 terms = "polynomial"
@@ -119,18 +120,33 @@ def init(
     except InputError as error:
         found, message = None, str(error)
     keys, noise = _frame_keys(found, message, image)
-    level = plateau(used[0][np.isfinite(used[0])])
+    light = used[0]
+    level = plateau(light[np.isfinite(light)])
     if level is not None:
         keys += f"saturation = {level!r}  # suspected: a plateau at the maximum\n"
-    widths = image_widths(used[0])
+        light = np.where(light < level, light, np.nan)
+    widths = image_widths(light)
     sigma = START if widths is None else widths.typical
+    varying = _varying(outward_widths(light, sigma))
     text = TEXT.format(
         name=printable(frame.name), path=toml_text(str(frame)), frame=keys, noise=noise,
-        catalogue=toml_text(f"{stem}.csv"), sigma=sigma,
+        catalogue=toml_text(f"{stem}.csv"), sigma=sigma, varying=varying,
         footprint=max(LEAST_FOOTPRINT, round(FOOTPRINT * sigma) + 2.0),
     )  # fmt: skip
     replace(path, text.encode())
     return Proposed(path, message)
+
+
+def _varying(widths: OutwardWidths | None) -> str:
+    """The line of [psf] that lets it vary over the field."""
+    if widths is None:
+        return (
+            "# degree = 1  # where the PSF varies over the field; of hundreds of sources nodes = 7 "
+            "instead"
+        )
+    key = f"nodes = {NODES}" if widths.number > EACH * NODES**2 else "degree = 2"
+    middle, outside = (f"{width:.2f}" for width in (widths.middle, widths.outside))
+    return f"{key}  # images are {middle} pixels wide in the middle, {outside} outside"
 
 
 def _masked(image: StoredImage) -> Floats:
