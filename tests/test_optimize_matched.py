@@ -88,6 +88,23 @@ def test_rejected_sources_are_not_counted() -> None:
     assert "48 of 48 sources matched, 2 sources" in reject_outliers(posterior)[1].message
 
 
+def test_sources_beyond_the_pixels_that_are_used_are_told_from_lost_ones() -> None:
+    """Three of 51, one of them behind the mask; of all others nothing is said."""
+    s = planted.field(2)
+    more = SourceCatalog(
+        np.append(s.x, [900.0, -900.0, 75.0]), np.append(s.y, [0.0, 0.0, 75.0]),
+        np.append(s.flux, [2e4, 2e4, 2e4]),
+    )  # fmt: skip
+    counts, mask = planted.counts(planted.camera(s), 2), np.ones(planted.SHAPE, bool)
+    j, i = (round(0.5 * (side - 1) + 75.0) for side in planted.SHAPE)
+    mask[j - 8 : j + 9, i - 8 : i + 9] = False
+    posterior = Posterior(planted.camera(more), counts, mask=mask)
+    said = "48 of 51 sources matched, 3 outside the pixels that are used"
+    assert said in find_map(posterior).message
+    everything = Posterior(planted.camera(s), counts)
+    assert "outside the pixels" not in find_map(everything).message
+
+
 def test_sources_outside_of_the_likelihood_are_not_judged() -> None:
     s = planted.field(3)
     posterior = planted.true(3)

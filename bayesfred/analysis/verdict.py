@@ -120,7 +120,8 @@ def judge_fit(
             causes = (*causes, displaced_alike(residuals.neighbours, scatters=scatters))
     fits = consist and not failures
     sums = " and ".join(_sum(fit, name) for name in ("deviance", "pearson"))
-    why = _poor_psf(posterior, params) + _why(causes)
+    poor = _poor_psf(posterior, params)
+    why = poor + _why(causes)
     if fits and not estimate.fits_data:
         fits, sentence = False, f"The parameters may be wrong: {estimate.message}."
     elif fits:
@@ -134,7 +135,9 @@ def judge_fit(
         bound = f"expectation (at most {CONSISTENT:.0f} if it did){matched}"
         sentence = f"The model does not fit the counts: {sums} {bound}. {why}"
     sentence += _far_off(residuals) + _in_common(posterior)
-    omitted = _omitted(posterior, fit, fits) + _unexplained(posterior, params, fits=fits)
+    omitted = _omitted(posterior, fit, fits)
+    if not (poor and poor in sentence):
+        omitted += _unexplained(posterior, params)
     return FitVerdict(fits, causes, sentence, omitted, unmatched)
 
 
@@ -343,10 +346,10 @@ def _omitted(posterior: Any, fit: Mapping[str, float], fits: bool) -> str:
     return f"{sentence}, and the misfit: as mere noise it would make them {factor:.2g} times wider."
 
 
-def _unexplained(posterior: Any, params: Floats, *, fits: bool) -> str:
-    """Say of a large model error that it is one; so large a one is said first of what misfits."""
+def _unexplained(posterior: Any, params: Floats) -> str:
+    """Say of a large model error that it is one."""
     error = _model_error(posterior, params)
-    if error <= CHECKED or (error > LARGEST_ERROR and not fits):
+    if error <= CHECKED:
         return ""
     return (
         f" The PSF leaves {error:.0%} of the light unexplained, and errors were checked up to "

@@ -252,21 +252,28 @@ def log_density(frame, parameters, cluster):
 
 
 @inner()
+def _walk(cluster, way, factor):
+    """Take so many times the shares of a step, of every source."""
+    step, shares = way
+    for i in range(shares.size):
+        own = factor * shares[i] * step[3 * i : 3 * i + 3]
+        change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+
+
+@inner()
 def turn_back(frame, parameters, cluster, way, value):
     """Go back by half a step, and half of that, until the log-density is not lower than `value`.
 
     Blended sources far from their maximum may go too far again and again. `way` is the step and
     what share of it was taken. Returns the log-density.
     """
-    step, shares = way
+    _, shares = way
     for _ in range(HALVES):
         here = log_density(frame, parameters, cluster)
         if here >= value:
             break
         shares *= 0.5
-        for i in range(shares.size):
-            own = -shares[i] * step[3 * i : 3 * i + 3]
-            change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+        _walk(cluster, way, -1.0)
     return here
 
 
@@ -282,14 +289,10 @@ def go_on(frame, parameters, cluster, way, value):
         for i in range(shares.size):
             if shares[i] * _relative(cluster, step, i) >= 0.5:
                 return value
-        for i in range(shares.size):
-            own = shares[i] * step[3 * i : 3 * i + 3]
-            change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+        _walk(cluster, way, 1.0)
         here = log_density(frame, parameters, cluster)
         if here <= value:
-            for i in range(shares.size):
-                own = -shares[i] * step[3 * i : 3 * i + 3]
-                change_source(cluster, cluster.group.members[i], own[0], own[1], own[2], 0.0)
+            _walk(cluster, way, -1.0)
             return value
         value = here
         shares *= 2.0
